@@ -37,7 +37,8 @@ def quaternion_multiply(a: Array, b: Array) -> Array:
 
 def quaternion_conjugate(q: Array) -> Array:
     """Inverse of a unit quaternion."""
-    return np.asarray(q) * (1.0, -1.0, -1.0, -1.0)
+    w, x, y, z = q
+    return np.array([w, -x, -y, -z])
 
 
 def rotation_from_quaternion(q: Array) -> Array:
@@ -65,8 +66,8 @@ def quaternion_from_rotation(R: Array) -> Array:
         q[1 + i] = 1 + R[i, i] - R[j, j] - R[l, l]
         q[1 + j] = R[j, i] + R[i, j]
         q[1 + l] = R[l, i] + R[i, l]
-    q = q / np.linalg.norm(q)
-    return q if q[0] >= 0 else -q
+    unit: Array = q / np.linalg.norm(q)
+    return unit if unit[0] >= 0 else -unit
 
 
 def exp_so3(theta: Array) -> Array:
@@ -90,7 +91,8 @@ def log_so3(R: Array) -> Array:
 
 def rotate(q: Array, v: Array) -> Array:
     """Rotate vectors (..., 3) by the unit quaternion q."""
-    return np.asarray(v) @ rotation_from_quaternion(q).T
+    rotated: Array = np.asarray(v) @ rotation_from_quaternion(q).T
+    return rotated
 
 
 def yaw_of(q: Array) -> float:

@@ -22,7 +22,9 @@ Keep = Literal["all", "latest"]
 class Pending(Protocol[M_co]):
     """A message that is still being computed elsewhere; `result` waits for it."""
 
-    def result(self) -> M_co: ...
+    def result(self) -> M_co:
+        """The message, waiting for it if it must."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,7 @@ class Output:
 
     topic: Topic[Any]
     message: Any
+    delay_ns: int = 0  # a sensor's own latency: when it becomes visible, after now
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +53,9 @@ class Topic(Generic[M]):
     deadline_s: float | None = None
     ros_type: str = field(default="", kw_only=True)
 
-    def __call__(self, message: M | Pending[M]) -> Output:
-        return Output(self, message)
+    def __call__(self, message: M | Pending[M], *, delay_ns: int = 0) -> Output:
+        """Wrap a message for publication."""
+        return Output(self, message, delay_ns)
 
 
 Outputs = Iterator[Output]  # what a handler yields; one that has nothing to say returns None

@@ -21,10 +21,12 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @property
     def p_body(self) -> Array:
+        """Position in the body frame, m, (3,)."""
         return np.array(self.xyz_m)
 
     @property
     def R_body_sensor(self) -> Array:
+        """Rotation that maps sensor vectors into the body frame, (3, 3)."""
         r, p, y = (math.radians(a) for a in self.rpy_deg)
         cr, sr, cp, sp, cy, sy = math.cos(r), math.sin(r), math.cos(p), math.sin(p), math.cos(y), math.sin(y)
         return np.array(

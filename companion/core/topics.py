@@ -10,13 +10,18 @@ from companion.core.node import Topic
 # sensors
 IMU = Topic("sensors/imu", m.ImuSample, 200.0, "all", deadline_s=0.05, ros_type="sensor_msgs/msg/Imu")
 LIDAR = Topic(
-    "sensors/lidar", m.LidarScan, 10.0, deadline_s=0.35, ros_type="sensor_msgs/msg/PointCloud2"
+    "sensors/lidar",
+    m.LidarScan,
+    10.0,
+    recorded=False,
+    deadline_s=0.35,
+    ros_type="sensor_msgs/msg/PointCloud2",
 )
-CAMERA = Topic("sensors/camera", m.CameraImage, 15.0, deadline_s=0.3, ros_type="sensor_msgs/msg/Image")
+CAMERA = Topic(
+    "sensors/camera", m.CameraImage, 15.0, recorded=False, deadline_s=0.3, ros_type="sensor_msgs/msg/Image"
+)
 RANGE = Topic("sensors/range", m.RangeReading, 20.0, deadline_s=0.3, ros_type="sensor_msgs/msg/Range")
-BARO = Topic(
-    "sensors/baro", m.BaroReading, 20.0, deadline_s=0.5, ros_type="sensor_msgs/msg/FluidPressure"
-)
+BARO = Topic("sensors/baro", m.BaroReading, 20.0, deadline_s=0.5, ros_type="sensor_msgs/msg/FluidPressure")
 # autopilot in
 MAVLINK_RX = Topic("mavlink/rx", m.MavlinkBytes, 0.0, "all")
 VEHICLE = Topic("autopilot/vehicle", m.VehicleStatus, 10.0, deadline_s=1.0)
@@ -25,9 +30,7 @@ COMMAND_RESULT = Topic("autopilot/command_result", m.CommandResult, 0.0, "all")
 LIO_STATE = Topic("estimation/lio_state", m.LioState, 25.0, "all")
 LIKELIHOOD = Topic("estimation/likelihood", m.PoseLikelihood, 25.0, "all")
 REGISTERED = Topic("estimation/registered_scan", m.RegisteredScan, 10.0, recorded=False)
-ODOMETRY = Topic(
-    "estimation/odometry", m.Odometry, 100.0, deadline_s=0.2, ros_type="nav_msgs/msg/Odometry"
-)
+ODOMETRY = Topic("estimation/odometry", m.Odometry, 100.0, deadline_s=0.2, ros_type="nav_msgs/msg/Odometry")
 SMOOTHED = Topic("estimation/smoothed", m.SmoothedState, 10.0)
 # mapping
 LOCAL_MAP = Topic("mapping/local_map", m.LocalMap, 5.0, recorded=False, deadline_s=1.0)

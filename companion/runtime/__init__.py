@@ -1,0 +1,1 @@
+"""Floor 3: the only sockets, threads, processes, files and clocks."""
