@@ -1,0 +1,58 @@
+"""The `companion` command: mounts the command groups and turns user errors into one line."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+from rich.console import Console
+
+import companion
+from companion.cli import config, doctor, fly, mavlink, mission, odometry
+from companion.core.errors import CompanionError
+
+app = typer.Typer(
+    name="companion",
+    help="Fly, check and inspect Understory missions. Example: companion fly missions/first_flight.yaml",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.command("fly")(fly.fly)
+app.command("doctor")(doctor.doctor)
+app.command("odometry")(odometry.odometry)
+
+
+def _group(name: str, help_text: str, **commands: object) -> None:
+    group = typer.Typer(help=help_text, no_args_is_help=True)
+    for command, function in commands.items():
+        group.command(command)(function)  # type: ignore[type-var]
+    app.add_typer(group, name=name)
+
+
+_group("mission", "Check mission files.", check=mission.check)
+_group("config", "Show the configuration.", dump=config.dump)
+_group("mavlink", "Look into MAVLink logs.", inspect=mavlink.inspect)
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
+    if version:
+        typer.echo(companion.__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point: exit codes 0 done, 1 the flight failed, 2 wrong input, 3 not reachable."""
+    debug = "--debug" in sys.argv
+    arguments = [a for a in sys.argv[1:] if a != "--debug"]
+    try:
+        app(args=arguments, standalone_mode=True)
+    except CompanionError as error:
+        if debug:
+            raise
+        Console(stderr=True, soft_wrap=True).print(f"[red]error:[/] {_escaped(error)}", highlight=False)
+        sys.exit(error.exit_code)
+
+
+def _escaped(error: CompanionError) -> str:
+    return str(error).replace("[", r"\[")

@@ -1,0 +1,1 @@
+"""What a flight leaves behind for people: the figures and the picture."""

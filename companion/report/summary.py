@@ -1,0 +1,135 @@
+"""A flight in figures: what `summary.json` holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from companion.core.geometry import (
+    quaternion_conjugate,
+    quaternion_from_yaw,
+    quaternion_multiply,
+    rotate,
+    yaw_of,
+)
+from companion.core.messages import Array
+from companion.report.tracks import Track, Tracks
+
+SEGMENT_M = 50.0  # drift is told over segments of this length, as in the KITTI benchmark
+MOVING_M_S = 0.3
+
+
+class Summary(msgspec.Struct, frozen=True, kw_only=True):
+    """Units stand in the names; NaN means that the flight gave no such figure."""
+
+    completed: bool
+    contact: str  # "" or what was touched
+    reason: str
+    seed: int
+    world: str
+    mission: str
+    min_clearance_m: float  # of the hull to trunks and branches, true
+    position_rmse_m: float  # estimate against truth, aligned at the start pose only
+    end_error_m: float
+    drift_percent: float  # mean relative translation error over 50 m segments, or end error / length
+    path_length_m: float
+    mean_speed_m_s: float  # while moving
+    max_speed_m_s: float
+    duration_s: float  # simulated
+    wall_s: float
+    real_time_factor: float
+    cpu_s: dict[str, float]
+    dropped: dict[str, int]
+    messages: int
+    flight_hash: str
+
+
+def trajectory_figures(tracks: Tracks) -> dict[str, float]:
+    """Accuracy, length, speed and clearance of a flight."""
+    truth = tracks.true_track()
+    if len(truth.t_s) < 2:
+        return dict.fromkeys(_FIGURES, float("nan"))
+    estimate, truth_then = aligned(tracks)
+    error = np.linalg.norm(estimate.p - truth_then.p, axis=1)
+    speed = np.linalg.norm([m.v_world for m in tracks.truth], axis=1)
+    moving = speed[speed > MOVING_M_S]
+    return {
+        "min_clearance_m": min(m.clearance_m for m in tracks.truth),
+        "position_rmse_m": float(np.sqrt((error**2).mean())) if len(error) else float("nan"),
+        "end_error_m": float(error[-1]) if len(error) else float("nan"),
+        "drift_percent": drift_percent(estimate, truth_then),
+        "path_length_m": path_length(truth.p),
+        "mean_speed_m_s": float(moving.mean()) if len(moving) else 0.0,
+        "max_speed_m_s": float(speed.max()),
+        "duration_s": float(truth.t_s[-1]),
+    }
+
+
+def path_length(p: Array) -> float:
+    """Length of a polyline (N, 3) without standing noise: steps shorter than 5 cm are joined."""
+    total, anchor = 0.0, p[0]
+    for q in p[1:]:
+        step = float(np.linalg.norm(q - anchor))
+        if step >= 0.05:
+            total, anchor = total + step, q
+    return total
+
+
+def aligned(tracks: Tracks) -> tuple[Track, Track]:
+    """(estimate in the world, truth at the same times), aligned by yaw and position of the start alone."""
+    truth, estimate = tracks.true_track(), tracks.estimated_track()
+    if not len(estimate.t_s):
+        return estimate, estimate
+    keep = estimate.t_s <= truth.t_s[-1]
+    estimate = Track(estimate.t_s[keep], estimate.p[keep], estimate.q[keep])
+    then = truth.at(estimate.t_s)
+    q_turn = quaternion_from_yaw(yaw_of(then.q[0]) - yaw_of(estimate.q[0]))
+    p = rotate(q_turn, estimate.p - estimate.p[0]) + then.p[0]
+    q = np.array([quaternion_multiply(q_turn, q) for q in estimate.q])
+    return Track(estimate.t_s, p, q), then
+
+
+def drift_percent(estimate: Track, truth: Track) -> float:
+    """Mean relative translation error over 50 m segments of true path, in percent.
+
+    Relative displacements are compared in the body frame of the segment's start (Geiger et al.,
+    KITTI, CVPR 2012). A flight under 50 m gets its end error over its length.
+    """
+    if len(truth.t_s) < 2:
+        return float("nan")
+    p_est, p_true = estimate.p[::10], truth.p[::10]
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(p_true, axis=0), axis=1))]
+    ends = np.searchsorted(along, along + SEGMENT_M)
+    errors = [
+        _relative_error(p_est[j] - p_est[i], p_true[j] - p_true[i], estimate.q[i * 10], truth.q[i * 10])
+        for i, j in enumerate(ends)
+        if j < len(along)
+    ]
+    if errors:
+        return 100.0 * float(np.mean(errors)) / SEGMENT_M
+    return 100.0 * float(np.linalg.norm(p_est[-1] - p_true[-1])) / max(float(along[-1]), 1.0)
+
+
+def _relative_error(step_est: Array, step_true: Array, q_est: Array, q_true: Array) -> float:
+    seen = rotate(quaternion_conjugate(q_est), step_est)
+    true = rotate(quaternion_conjugate(q_true), step_true)
+    return float(np.linalg.norm(seen - true))
+
+
+_FIGURES: tuple[str, ...] = (
+    "min_clearance_m", "position_rmse_m", "end_error_m", "drift_percent",
+    "path_length_m", "mean_speed_m_s", "max_speed_m_s", "duration_s",
+)  # fmt: skip
+
+
+def to_json(summary: Summary) -> bytes:
+    """Indented JSON; NaN becomes null."""
+    return msgspec.json.format(msgspec.json.encode(_rounded(msgspec.to_builtins(summary))), indent=2)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return round(value, 4) if isinstance(value, float) else value

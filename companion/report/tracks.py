@@ -1,0 +1,68 @@
+"""What the report keeps of a flight while it runs: a few columns, not the messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from companion.core import topics
+from companion.core.messages import Array, GroundTruth, MissionStatus, Odometry, PlanStatus, SafetyStatus, Why
+from companion.core.node import Topic
+
+
+@dataclass(slots=True)
+class Tracks:
+    """Listens to a flight; `truth` is the simulator's word, everything else the stack's."""
+
+    truth: list[GroundTruth] = field(default_factory=list)
+    odometry: list[Odometry] = field(default_factory=list)
+    plans: list[PlanStatus] = field(default_factory=list)
+    mission: list[MissionStatus] = field(default_factory=list)
+    safety: list[SafetyStatus] = field(default_factory=list)
+    why: list[Why] = field(default_factory=list)
+
+    def heard(self, topic: Topic[Any], message: Any) -> None:
+        """Keep what the report needs."""
+        lists: dict[str, list[Any]] = {
+            topics.TRUTH.name: self.truth,
+            topics.ODOMETRY.name: self.odometry,
+            topics.PLAN.name: self.plans,
+            topics.MISSION.name: self.mission,
+            topics.SAFETY.name: self.safety,
+            topics.WHY.name: self.why,
+        }
+        if topic.name in lists:
+            lists[topic.name].append(message)
+
+    def true_track(self) -> Track:
+        """Where the vehicle was, in the world."""
+        return _track(self.truth, "p_world", "q_world_body")
+
+    def estimated_track(self) -> Track:
+        """Where the stack thought it was, in odom."""
+        return _track(self.odometry, "p_odom", "q_odom_body")
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A trajectory in columns."""
+
+    t_s: Array  # (N,)
+    p: Array  # m, (N, 3)
+    q: Array  # wxyz, (N, 4)
+
+    def at(self, times: Array) -> Track:
+        """Positions interpolated, attitudes of the nearest sample."""
+        p = np.column_stack([np.interp(times, self.t_s, self.p[:, k]) for k in range(3)])
+        nearest = np.clip(np.searchsorted(self.t_s, times), 0, len(self.t_s) - 1)
+        return Track(times, p, self.q[nearest])
+
+
+def _track(messages: list[Any], position: str, attitude: str) -> Track:
+    if not messages:
+        return Track(np.empty(0), np.empty((0, 3)), np.empty((0, 4)))
+    times = np.array([m.stamp_ns for m in messages]) * 1e-9
+    p = np.array([getattr(m, position) for m in messages])
+    return Track(times, p, np.array([getattr(m, attitude) for m in messages]))
