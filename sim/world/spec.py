@@ -1,0 +1,104 @@
+"""What a world is made of: one strict struct per kind, read from YAML or from `key=value` options.
+
+Leaves exist only above `crown_base_m`; a tree that is not higher carries none. Trunks and
+branches are obstacles for the hull and for the sensors, leaves for the sensors alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import msgspec
+
+from companion.core.errors import InputError
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Span = tuple[NotNegative, NotNegative]
+
+
+class EmptySpec(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="empty"
+):
+    """Ground without trees; also the ground of the other kinds."""
+
+    seed: Annotated[int, msgspec.Meta(ge=0)] | None = None  # fixes the layout; None: the flight's own seed
+    size_m: Annotated[float, msgspec.Meta(ge=10, le=500)] = 120.0  # side of the square stand
+    margin_m: Annotated[float, msgspec.Meta(ge=2, le=200)] = 20.0  # bare ground around the stand
+    cell_m: Annotated[float, msgspec.Meta(ge=0.1, le=5)] = 0.5  # of the height field
+    slope_deg: Annotated[float, msgspec.Meta(ge=0, le=45)] = 0.0
+    slope_heading_deg: float = 0.0  # uphill, from +x towards +y
+    roughness_m: Annotated[float, msgspec.Meta(ge=0, le=5)] = 0.1  # rms of the bumps
+    roughness_length_m: Positive = 6.0  # size of the bumps
+    start_m: tuple[float, float] | None = None  # in the map's coordinates; None: most open near the centre
+    clearing_m: NotNegative = 2.0  # free radius around the start
+
+
+class TreesSpec(EmptySpec, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What stands on stems wherever they come from."""
+
+    height_max_m: Annotated[float, msgspec.Meta(ge=3, le=100)] = 29.0  # of the dbh-height curve
+    height_rate_per_m: Positive = 3.0  # h = 1.3 + (height_max - 1.3) (1 - exp(-rate dbh)), Meyer 1940
+    height_sd: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.08  # relative spread around the curve
+    lean_deg: Annotated[float, msgspec.Meta(ge=0, le=30)] = 1.5  # sigma per axis
+    crown: bool = True  # leaves, or a bare stand
+    crown_base_m: Positive = 8.0  # no leaf below, above ground
+    crown_radius_m: Positive = 1.8
+    leaves: Count = 150  # triangles per tree
+    leaf_m: Positive = 0.3  # size of one triangle (a cluster of leaves)
+    branches: Count = 0  # thin, leafless, per tree
+    branch_length_m: Span = (0.5, 1.5)
+    branch_diameter_m: Span = (0.01, 0.04)  # at the trunk
+    branch_height_m: Span = (0.5, 8.0)  # above ground
+
+
+class PoissonSpec(TreesSpec, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="poisson"):
+    """Random stems; a hard core keeps them apart."""
+
+    stems_per_ha: Annotated[float, msgspec.Meta(ge=0, le=10000)] = 400.0
+    min_spacing_m: NotNegative = 1.5  # between stem centres
+    dbh_mean_m: Positive = 0.25  # log-normal
+    dbh_sd_m: NotNegative = 0.08
+
+
+class StemsSpec(TreesSpec, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="stems"):
+    """A measured stem map; none of its trees is ever removed."""
+
+    file: str
+    unit: Literal["cm", "m"] | None = None  # of the diameters, if the header does not say it
+    plot: int | str | None = None  # which one, if the file holds several
+
+
+WorldSpec = EmptySpec | PoissonSpec | StemsSpec
+KINDS: dict[str, type[EmptySpec]] = {"empty": EmptySpec, "poisson": PoissonSpec, "stems": StemsSpec}
+
+
+def parse_spec(values: Mapping[str, object], *, file: str = "") -> WorldSpec:
+    """Check a mapping with key `kind`; raises InputError with the field and what is valid."""
+    kind = values.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise InputError(f"unknown kind {kind!r}", file=file, field="kind", valid=", ".join(KINDS))
+    try:
+        spec: WorldSpec = msgspec.convert(dict(values), WorldSpec)
+    except msgspec.ValidationError as error:
+        raise _readable(error, KINDS[kind], file) from None
+    for name in ("branch_length_m", "branch_diameter_m", "branch_height_m"):
+        low, high = getattr(spec, name, (0.0, 0.0))
+        if low > high:
+            raise InputError(f"{low} exceeds {high}", file=file, field=name, valid="low, high")
+    return spec
+
+
+def _readable(error: msgspec.ValidationError, spec: type[EmptySpec], file: str) -> InputError:
+    text = str(error)
+    names = ", ".join(spec.__struct_fields__)
+    unknown = re.search(r"unknown field `(\w+)`", text)
+    missing = re.search(r"missing required field `(\w+)`", text)
+    if found := unknown or missing:
+        problem = "unknown key" if unknown else "is required"
+        return InputError(problem, file=file, field=found[1], valid=names)
+    problem, _, place = text.partition(" - at `$.")
+    return InputError(problem, file=file, field=place.rstrip("`"))
