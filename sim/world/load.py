@@ -122,10 +122,7 @@ def _stand(
 
 def _start(spec: WorldSpec, xy: Array, dbh_m: Array, low: Array, high: Array) -> Array:
     """Where the flight starts; a measured map must have room there."""
-    if spec.start_m is None:
-        start = stand.open_place(xy, dbh_m, low, high)
-    else:
-        start = np.array(spec.start_m)
+    start = np.array(spec.start_m) if spec.start_m else stand.open_place(xy, dbh_m, low, high)
     if np.any(start < low) or np.any(start > high):
         valid = f"x {low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}"
         raise InputError("lies outside the stand", field="start_m", valid=valid)

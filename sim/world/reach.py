@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from companion.core.messages import Array
 from sim.world.terrain import _height
+
+if TYPE_CHECKING:
+    from sim.world.world import World
 
 _CELL_M = 1.0
 
@@ -24,14 +27,6 @@ class ConeGrid:
     shape: tuple[int, int]  # nx, ny, cells of 1 m
     start: NDArray[np.int64]  # (nx * ny + 1,)
     items: NDArray[np.int64]
-
-
-class _Solid(Protocol):
-    cones: Array
-    heights: Array
-    origin_xy: Array
-    cell_m: float
-    grid: ConeGrid
 
 
 def grid_of(cones: Array) -> ConeGrid:
@@ -54,14 +49,14 @@ def grid_of(cones: Array) -> ConeGrid:
     return ConeGrid(origin, (shape[0], shape[1]), start, item[np.argsort(cell, kind="stable")])
 
 
-def first_hit(solid: _Solid, p_world: Array, direction: Array, max_range_m: float) -> float:
+def first_hit(world: World, p_world: Array, direction: Array, max_range_m: float) -> float:
     """Distance along a unit direction to the first surface; inf if none within `max_range_m`."""
     p, d = np.asarray(p_world, np.float64), np.asarray(direction, np.float64)
     if not (np.all(np.isfinite(p)) and np.all(np.isfinite(d))):
         return math.inf
-    g = solid.grid
-    ground = _ground_hit(solid.heights, solid.origin_xy, solid.cell_m, p, d, max_range_m)
-    hit = _cone_hit(solid.cones, g.origin_xy, g.shape, g.start, g.items, p, d, min(ground, max_range_m))
+    g = world.grid
+    ground = _ground_hit(world.heights, world.origin_xy, world.cell_m, p, d, max_range_m)
+    hit = _cone_hit(world.cones, g.origin_xy, g.shape, g.start, g.items, p, d, min(ground, max_range_m))
     return float(hit if hit < max_range_m else ground)
 
 
@@ -93,7 +88,7 @@ def _ground_hit(heights, origin_xy, cell_m, p, d, reach):  # type: ignore[no-unt
 def _cone_hit(cones, origin_xy, shape, start, items, p, d, reach):  # type: ignore[no-untyped-def]
     """Walk the columns that the ray crosses (Amanatides and Woo, 1987)."""
     x, y = p[0] - origin_xy[0], p[1] - origin_xy[1]
-    i, j = int(math.floor(x)), int(math.floor(y))
+    i, j = math.floor(x), math.floor(y)
     si, sj = 1 if d[0] > 0 else -1, 1 if d[1] > 0 else -1
     dt_x = 1.0 / abs(d[0]) if d[0] != 0.0 else np.inf
     dt_y = 1.0 / abs(d[1]) if d[1] != 0.0 else np.inf
