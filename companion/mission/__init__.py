@@ -1,0 +1,1 @@
+"""Missions: a YAML file becomes goals, commands and decisions; `model` reads, `executor` flies."""
