@@ -8,7 +8,7 @@ distortion, rolling shutter, shadows, motion blur.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -26,6 +26,7 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 _STREAM = 2  # of the random numbers
 _STEP = 2  # px between the corners of the first cast
 _LIGHT = (0.35, 0.25, 0.9)  # direction to the sky's bright side; need not be unit
+_CENTER_PX = 512.0  # of the photograph, over the world's origin
 _SKY, _BARK = 235.0, 0.55  # grey of the sky; bark against the ground's picture
 
 
@@ -92,7 +93,7 @@ class Camera:
         return depth, triangle
 
 
-def _directions(pinhole: Pinhole, u_px: Array, v_px: Array) -> Array32:
+def _directions(pinhole: Pinhole, u_px: NDArray[Any], v_px: NDArray[Any]) -> Array32:
     """Rays (len(v), len(u), 3) through image points, z = 1, in the optical frame."""
     cx, cy = pinhole.center_px
     dirs = np.ones((len(v_px), len(u_px), 3), np.float32)
@@ -193,7 +194,9 @@ def _draw(view, surface, scale, light, pixels):  # type: ignore[no-untyped-def]
                 x = p[0] + R[0, 0] * d0 + R[0, 1] * d1 + R[0, 2] * t
                 y = p[1] + R[1, 0] * d0 + R[1, 1] * d1 + R[1, 2] * t
                 if classes[triangle[i, j]] == GROUND:
-                    grey = _sample(flat, starts, x * per_m, y * per_m, t * per_depth)
+                    grey = _sample(
+                        flat, starts, x * per_m + _CENTER_PX, y * per_m + _CENTER_PX, t * per_depth
+                    )
                 else:
                     z = p[2] + R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * t
                     bark = _sample(flat, starts, 2.0 * (x - y) * per_m, 0.7 * z * per_m, t * per_depth)

@@ -15,7 +15,7 @@ _STROKES_HZ = 700.0 + 10.0 * 0.6180339887  # up and down; the golden part keeps 
 
 
 def spin_pattern(beams: int, columns: int, elevation_deg: tuple[float, float]) -> tuple[Array32, Array32]:
-    """Directions (N, 3) and phases in [0, 1) (N,) of a spinning LiDAR, column by column, turning clockwise."""
+    """Directions (N, 3) and phases in [0, 1) (N,) of a LiDAR that spins clockwise, by columns."""
     column, beam = np.divmod(np.arange(beams * columns), beams)
     low, high = np.radians(elevation_deg)
     elevation = low + (high - low) * beam / max(beams - 1, 1)

@@ -7,52 +7,44 @@ Python's lock, so only another process overlaps with the stack's work.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar
-
-import numpy as np
+from typing import Any, Generic, Protocol, Self, TypeVar, cast
 
 from companion.core.messages import Array, CameraImage, LidarScan
 from companion.core.node import Pending
 from companion.core.rig import Rig
-from sim.sensors.camera import Camera, CameraConfig
-from sim.sensors.caster import Caster
-from sim.sensors.lidar import Lidar, LidarConfig
-from sim.world.world import World
+from sim.sensors.camera import CameraConfig
+from sim.sensors.lidar import LidarConfig
+from sim.sensors.scene import RenderSetup, Sensors
+from sim.sensors.worker import RenderError, Worker
+from sim.world.model import World
 
+__all__ = ["InlineRenderer", "RenderError", "Renderer", "WorkerRenderer"]
 M = TypeVar("M")
 
 
-@dataclass(frozen=True)
-class RenderSetup:
-    """Everything that a renderer must know; `rig` is where the sensors truly sit."""
-
-    world: World
-    rig: Rig = field(default_factory=Rig)
-    lidar: LidarConfig = field(default_factory=LidarConfig)
-    camera: CameraConfig = field(default_factory=CameraConfig)
-    seed: int = 0
-
-    @property
-    def message_bytes(self) -> int:
-        """Most that the arrays of one message take."""
-        pinhole = self.rig.pinhole
-        return max(16 * self.lidar.rays + 64, pinhole.width_px * pinhole.height_px)
-
-
 class Renderer(Protocol):
-    """What the simulator's sensors ask for; see `Lidar.scan` and `Camera.frame` for the arguments."""
+    """What the simulator's sensors ask for."""
+
+    cpu_s: dict[str, float]  # CPU seconds spent on "lidar" and "camera" so far, wherever
 
     def submit_lidar(
         self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
-    ) -> Pending[LidarScan]: ...
+    ) -> Pending[LidarScan]:
+        """A sweep that ends at the stamp, from body poses (K, 3), (K, 4) at `knot_stamps`.
+
+        Faults as in `Lidar.scan`: `lost_fraction`, `dust_fraction`.
+        """
 
     def submit_camera(
         self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
-    ) -> Pending[CameraImage]: ...
+    ) -> Pending[CameraImage]:
+        """A frame at the stamp, from the body pose (3,), (4,); the fault is `gain`, as in `Camera.frame`."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Free what the renderer holds."""
 
 
 @dataclass(frozen=True)
@@ -66,51 +58,29 @@ class Done(Generic[M]):
         return self.value
 
 
-class Sensors:
-    """The models over one scene; `render` is all that a worker needs."""
-
-    def __init__(self, setup: RenderSetup) -> None:
-        mesh, rig = setup.world.mesh, setup.rig
-        caster = Caster(mesh)
-        self.lidar = Lidar(setup.lidar, rig.lidar, caster, mesh, setup.seed)
-        self.camera = Camera(setup.camera, rig.camera, rig.pinhole, caster=caster, mesh=mesh, seed=setup.seed)
-
-    def render(self, kind: str, request: dict[str, Any]) -> LidarScan | CameraImage:
-        """One message of kind `lidar` or `camera`."""
-        return self.lidar.scan(**request) if kind == "lidar" else self.camera.frame(**request)
-
-    def warm(self) -> None:
-        """Compile and touch everything once, so that no first message stalls."""
-        p, q = np.array([0.0, 0.0, 2.0]), np.array([1.0, 0.0, 0.0, 0.0])
-        self.lidar.scan(np.stack([p, p]), np.stack([q, q]), stamp_ns=0, counter=0)
-        self.camera.frame(p, q, stamp_ns=0, counter=0)
-
-
-class InlineRenderer:
-    """Renders at once, in the calling thread."""
-
-    def __init__(self, setup: RenderSetup) -> None:
-        self._sensors = Sensors(setup)
-        self._sensors.warm()
+class _Base(ABC):
+    """The requests, written once; a subclass says how one is served."""
 
     def submit_lidar(
         self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
-    ) -> Done[LidarScan]:
-        """A sweep; body poses (K, 3), (K, 4) at `knot_stamps`."""
-        return Done(
-            self._sensors.lidar.scan(p_world, q_world_body, stamp_ns=stamp_ns, counter=counter, **faults)
-        )
+    ) -> Pending[LidarScan]:
+        """See Renderer."""
+        request = dict(p_world=p_world, q_world_body=q_world_body, stamp_ns=stamp_ns, counter=counter)
+        return cast("Pending[LidarScan]", self._submit("lidar", {**request, **faults}))
 
     def submit_camera(
         self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
-    ) -> Done[CameraImage]:
-        """A frame; body pose (3,), (4,) at the stamp."""
-        return Done(
-            self._sensors.camera.frame(p_world, q_world_body, stamp_ns=stamp_ns, counter=counter, **faults)
-        )
+    ) -> Pending[CameraImage]:
+        """See Renderer."""
+        request = dict(p_world=p_world, q_world_body=q_world_body, stamp_ns=stamp_ns, counter=counter)
+        return cast("Pending[CameraImage]", self._submit("camera", {**request, **faults}))
 
+    @abstractmethod
+    def _submit(self, kind: str, request: dict[str, Any]) -> Pending[Any]: ...
+
+    @abstractmethod
     def close(self) -> None:
-        """Nothing to end."""
+        """Free what the renderer holds."""
 
     def __enter__(self) -> Self:
         return self
@@ -119,3 +89,49 @@ class InlineRenderer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class InlineRenderer(_Base):
+    """Renders at once, in the calling thread."""
+
+    def __init__(
+        self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int
+    ) -> None:
+        self.cpu_s = {"lidar": 0.0, "camera": 0.0}
+        self._sensors = Sensors(RenderSetup(world.mesh, lidar, camera, rig, seed))
+        self._sensors.warm()
+
+    def _submit(self, kind: str, request: dict[str, Any]) -> Pending[Any]:
+        message, cpu_s = self._sensors.render(kind, request)
+        self.cpu_s[kind] += cpu_s
+        return Done(message)
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class WorkerRenderer(_Base):
+    """Renders in a spawned process: `submit_*` returns at once, `result` waits; served in order.
+
+    A script that uses it must guard its entry with `if __name__ == "__main__"`, as every
+    spawned process demands. The worker compiles while its parent goes on; `wait_ready`
+    waits for it. It ends by itself when its parent is gone. `result` raises RenderError with
+    the worker's own traceback.
+    """
+
+    def __init__(
+        self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int
+    ) -> None:
+        self.cpu_s = {"lidar": 0.0, "camera": 0.0}
+        self._worker = Worker(RenderSetup(world.mesh, lidar, camera, rig, seed), self.cpu_s)
+
+    def wait_ready(self) -> None:
+        """Block until the worker has built and compiled everything; raises RenderError."""
+        self._worker.wait_ready()
+
+    def _submit(self, kind: str, request: dict[str, Any]) -> Pending[Any]:
+        return self._worker.submit(kind, request)
+
+    def close(self) -> None:
+        """End the worker and free its memory; results not fetched fail with RenderError."""
+        self._worker.close()

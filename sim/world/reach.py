@@ -14,7 +14,7 @@ from companion.core.messages import Array
 from sim.world.terrain import _height
 
 if TYPE_CHECKING:
-    from sim.world.world import World
+    from sim.world.model import World
 
 _CELL_M = 1.0
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args, get_type_hints
 
 import msgspec
 
@@ -47,8 +47,8 @@ class TreesSpec(EmptySpec, frozen=True, forbid_unknown_fields=True, kw_only=True
     crown: bool = True  # leaves, or a bare stand
     crown_base_m: Positive = 8.0  # no leaf below, above ground
     crown_radius_m: Positive = 1.8
-    leaves: Count = 150  # triangles per tree
-    leaf_m: Positive = 0.3  # size of one triangle (a cluster of leaves)
+    leaves: Count = 100  # triangles per tree
+    leaf_m: Positive = 0.35  # size of one triangle (a cluster of leaves)
     branches: Count = 0  # thin, leafless, per tree
     branch_length_m: Span = (0.5, 1.5)
     branch_diameter_m: Span = (0.01, 0.04)  # at the trunk
@@ -101,4 +101,7 @@ def _readable(error: msgspec.ValidationError, spec: type[EmptySpec], file: str) 
         problem = "unknown key" if unknown else "is required"
         return InputError(problem, file=file, field=found[1], valid=names)
     problem, _, place = text.partition(" - at `$.")
-    return InputError(problem, file=file, field=place.rstrip("`"))
+    field = re.split(r"[`\[.]", place)[0]
+    choices = [c for part in get_args(get_type_hints(spec).get(field)) for c in get_args(part)]
+    valid = ", ".join(c for c in choices if isinstance(c, str))
+    return InputError(problem, file=file, field=field, valid=valid)

@@ -8,6 +8,7 @@ import numpy as np
 
 from companion.core.errors import InputError
 from companion.core.messages import Array
+from sim.world.model import Stems
 from sim.world.spec import PoissonSpec, TreesSpec
 
 ROOT_M = 0.3  # a trunk starts this far below the ground
@@ -85,16 +86,16 @@ def free_radius(xy: Array, dbh_m: Array, point: Array) -> float:
     return float(gaps.min(initial=math.inf))
 
 
-def trunk_cones(stems: Array, lean_deg: float, rng: np.random.Generator) -> Array:
-    """Cones (N, 9) of stems (N, 5: x, y, z_ground, dbh, height); radius is linear in height."""
+def trunk_cones(stems: Stems, lean_deg: float, rng: np.random.Generator) -> Array:
+    """Cones (N, 9) of stems; radius is linear in height."""
     count = len(stems)
     axis = np.ones((count, 3))
     axis[:, :2] = np.tan(np.radians(lean_deg) * np.clip(rng.standard_normal((count, 2)), -3, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    radius, height = stems[:, 3] / 2, stems[:, 4]
+    radius, height = stems.dbh_m / 2, stems.height_m
     taper = radius * (1 - _TIP) / (height - _BREAST_M)
     cones = np.empty((count, 9))
-    cones[:, :3] = stems[:, :3] - ROOT_M * axis
+    cones[:, :3] = np.column_stack([stems.x, stems.y, stems.z_ground]) - ROOT_M * axis
     cones[:, 3:6] = axis
     cones[:, 6] = height + ROOT_M
     cones[:, 7] = radius + taper * (_BREAST_M + ROOT_M)
