@@ -1,0 +1,77 @@
+"""Places goals: home, map and body frames -> odom, through the newest correction of odom in map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from companion.core.geometry import (
+    IDENTITY_Q,
+    quaternion_conjugate,
+    quaternion_from_yaw,
+    rotate,
+    wrap_angle,
+    yaw_of,
+)
+from companion.core.messages import Array, Odometry, SmoothedState
+from companion.mission.route import Leg
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Correction:
+    """Where odom's origin and axes lie in map."""
+
+    p_map_odom: Array  # (3,)
+    q_map_odom: Array  # wxyz, (4,)
+
+    @classmethod
+    def newest(cls, smoothed: SmoothedState | None) -> Correction:
+        """From the graph's newest state; the identity before the first."""
+        if smoothed is None:
+            return cls(p_map_odom=np.zeros(3), q_map_odom=IDENTITY_Q)
+        return cls(p_map_odom=smoothed.p_map_odom, q_map_odom=smoothed.q_map_odom)
+
+    @property
+    def yaw(self) -> float:
+        """Heading of odom's x in map, rad."""
+        return yaw_of(self.q_map_odom)
+
+    def to_map(self, p_odom: Array) -> Array:
+        """Points (..., 3), odom -> map."""
+        return rotate(self.q_map_odom, p_odom) + self.p_map_odom
+
+    def to_odom(self, p_map: Array) -> Array:
+        """Points (..., 3), map -> odom."""
+        return rotate(quaternion_conjugate(self.q_map_odom), p_map - self.p_map_odom)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Places:
+    """What the frames of a step stand for, fixed when the step begins. Home has the axes of map."""
+
+    p_map_home: Array  # where it armed, (3,)
+    p_map_start: Array  # where the step began, (3,)
+    yaw_map_start: float  # rad
+
+    @classmethod
+    def at(cls, odometry: Odometry, correction: Correction, p_map_home: Array) -> Places:
+        """A step begins here."""
+        yaw = yaw_of(odometry.q_odom_body) + correction.yaw
+        p_map_start = correction.to_map(odometry.p_odom)
+        return cls(p_map_home=p_map_home, p_map_start=p_map_start, yaw_map_start=yaw)
+
+    def p_map(self, leg: Leg) -> Array:
+        """The leg's goal in map, (3,)."""
+        if leg.frame == "body":
+            return self.p_map_start + rotate(quaternion_from_yaw(self.yaw_map_start), leg.p)
+        return leg.p + (self.p_map_home if leg.frame == "home" else 0.0)
+
+    def yaw_map(self, yaw: float | Literal["along_path", "hold"], frame: str) -> float:
+        """Heading in map, rad; NaN: along the path."""
+        if yaw == "along_path":
+            return float("nan")
+        if yaw == "hold":
+            return self.yaw_map_start
+        return wrap_angle(yaw + (self.yaw_map_start if frame == "body" else 0.0))
