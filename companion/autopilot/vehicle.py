@@ -1,0 +1,150 @@
+"""What the autopilot says of itself, gathered from its messages."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from companion.autopilot import frames
+from companion.autopilot.modes import AUTOPILOT_ARDUPILOT, Flavour, mode_name
+from companion.core.messages import Array, VehicleStatus, freeze
+
+HEARTBEAT: Final = 0
+SYS_STATUS: Final = 1
+LOCAL_POSITION: Final = 32
+BATTERY_STATUS: Final = 147
+EKF_STATUS_REPORT: Final = 193  # ArduPilot's
+ESTIMATOR_STATUS: Final = 230  # PX4's
+EXTENDED_SYS_STATE: Final = 245
+STATUSTEXT: Final = 253
+
+_ARMED: Final = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
+_NOT_AN_AUTOPILOT: Final = 8  # MAV_AUTOPILOT_INVALID
+_ON_GROUND: Final = 1  # MAV_LANDED_STATE
+_PREARM_CHECK: Final = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
+# ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS share these bits
+_NEEDED: Final = 1 | 2 | 4 | 32  # attitude, horizontal and vertical velocity, height
+_POSITION: Final = 8 | 16  # relative or absolute
+_EKF_NO_AIDING: Final = 128 | 1024  # EKF_STATUS_REPORT only: constant position, uninitialised
+
+
+class Vehicle:
+    """Feed decoded messages of the one autopilot with `take`; read `status`."""
+
+    def __init__(self, *, heartbeat_timeout_s: float, data_timeout_s: float, require_prearm: bool) -> None:
+        self._heartbeat_timeout_ns = round(heartbeat_timeout_s * 1e9)
+        self._data_timeout_ns = round(data_timeout_s * 1e9)
+        self._require_prearm = require_prearm
+        self._heard: dict[int, int] = {}  # message id -> stamp of the newest
+        self._armed = False
+        self._custom_mode = 0
+        self._landed_state = 0
+        self._prearm_ok = False
+        self._estimator_ok = False
+        self._battery = float("nan")
+        self._p_odom, self._v_odom = np.full(3, np.nan), np.full(3, np.nan)
+        self._text = _Text()
+        self.flavour: Flavour = "px4"
+
+    def take(self, msg_id: int, message: Any, now_ns: int) -> None:
+        """Note one message; ids without meaning here are ignored."""
+        match msg_id:
+            case 0:
+                if not self._take_heartbeat(message):
+                    return
+            case 1:
+                self._prearm_ok = bool(message.onboard_control_sensors_health & _PREARM_CHECK)
+                self._take_battery(message.battery_remaining)
+            case 32:
+                self._p_odom = frames.swap_world(np.array(message[1:4]))
+                self._v_odom = frames.swap_world(np.array(message[4:7]))
+            case 147:
+                if message.id == 0:
+                    self._take_battery(message.battery_remaining)
+            case 193 | 230:
+                self._take_estimator(msg_id, message.flags)
+            case 245:
+                self._landed_state = message.landed_state
+            case 253:
+                self._text.take(message)
+        self._heard[msg_id] = now_ns
+
+    def _take_heartbeat(self, message: Any) -> bool:
+        if message.autopilot == _NOT_AN_AUTOPILOT:
+            return False
+        self.flavour = "ardupilot" if message.autopilot == AUTOPILOT_ARDUPILOT else "px4"
+        self._armed = bool(message.base_mode & _ARMED)
+        self._custom_mode = message.custom_mode
+        return True
+
+    def _take_battery(self, percent: int) -> None:
+        if percent >= 0:  # -1: not measured
+            self._battery = percent / 100
+
+    def _take_estimator(self, msg_id: int, flags: int) -> None:
+        aided = msg_id == ESTIMATOR_STATUS or not flags & _EKF_NO_AIDING
+        self._estimator_ok = flags & _NEEDED == _NEEDED and bool(flags & _POSITION) and aided
+
+    def connected(self, now_ns: int) -> bool:
+        """A heartbeat came within the timeout."""
+        return self._fresh(HEARTBEAT, now_ns, self._heartbeat_timeout_ns)
+
+    def _fresh(self, msg_id: int, now_ns: int, timeout_ns: int) -> bool:
+        heard = self._heard.get(msg_id)
+        return heard is not None and now_ns - heard <= timeout_ns
+
+    def _positioned(self, now_ns: int) -> bool:
+        return self._fresh(LOCAL_POSITION, now_ns, self._data_timeout_ns)
+
+    def _ready(self, now_ns: int) -> bool:
+        if not self.connected(now_ns) or not self._positioned(now_ns) or not self._estimator_ok:
+            return False
+        slow_ns = 3 * self._data_timeout_ns  # sent at 1 Hz
+        estimator = ESTIMATOR_STATUS if self.flavour == "px4" else EKF_STATUS_REPORT
+        if not self._fresh(estimator, now_ns, slow_ns):
+            return False
+        return not self._require_prearm or (self._prearm_ok and self._fresh(SYS_STATUS, now_ns, slow_ns))
+
+    def _landed(self) -> bool:
+        """Without EXTENDED_SYS_STATE, disarmed rotors are the evidence."""
+        return self._landed_state == _ON_GROUND if self._landed_state else not self._armed
+
+    def status(self, now_ns: int) -> VehicleStatus:
+        """Everything in our frames; position and velocity are NaN once they are stale."""
+        fresh = self._positioned(now_ns)
+        status: VehicleStatus = freeze(
+            VehicleStatus(
+                stamp_ns=now_ns,
+                connected=self.connected(now_ns),
+                armed=self._armed,
+                mode=mode_name(self._custom_mode, self.flavour) if HEARTBEAT in self._heard else "",
+                landed=self._landed(),
+                ready=self._ready(now_ns),
+                battery_fraction=self._battery,
+                p_odom=_copy_or_nan(self._p_odom, fresh),
+                v_odom=_copy_or_nan(self._v_odom, fresh),
+                text=self._text.newest,
+            )
+        )
+        return status
+
+
+def _copy_or_nan(v: Array, fresh: bool) -> Array:
+    return v.copy() if fresh else np.full(3, np.nan)
+
+
+class _Text:
+    """STATUSTEXT, joined again when it came in chunks (same id, rising chunk_seq)."""
+
+    def __init__(self) -> None:
+        self.newest = ""
+        self._id = 0
+
+    def take(self, message: Any) -> None:
+        text = message.text
+        if message.id and message.id == self._id and message.chunk_seq:
+            self.newest += text
+        else:
+            self.newest = text
+        self._id = message.id
