@@ -181,11 +181,11 @@ def test_beams_into_the_own_body_say_nothing(meadow):
 
 def test_thin_branches_fade_with_range(tmp_path):
     """Beams at 2 cm sticks: all return at 4 m, a quarter at 13 m, by (d / (3 mrad r))^2."""
-    rows = [f"{x:.2f},0,0.5,15" for x in np.arange(0, 30, 10.0)]
-    (tmp_path / "s.csv").write_text("x_m,y_m,dbh_m,h_m\n" + "\n".join(rows) + "\n0,20,0.5,15\n")
+    rows = [f"{x:.1f},0.0,0.3,15" for x in (-12.0, -5.0, 5.0, 13.0)]
+    (tmp_path / "s.csv").write_text("x_m,y_m,dbh_m,h_m\n" + "\n".join(rows) + "\n0,-30,0.3,15\n0,30,0.3,15\n")
     options = {
         "branches": 400, "branch_diameter_m": [0.0267, 0.0267], "branch_length_m": [3.0, 3.0], "crown": False,
-        "branch_height_m": [1.0, 12.0],
+        "branch_height_m": [1.0, 12.0], "start_m": [0.0, 0.0], "clearing_m": 1.5,
     }  # fmt: skip
     world = load_world(f"stems:{tmp_path}/s.csv", seed=0, options=options)
     place = world, Caster(world.mesh)

@@ -40,8 +40,14 @@ def as_bytes(message):
     )
 
 
-def test_inline_and_worker_give_equal_bytes_in_any_order(parts):
-    with InlineRenderer(*parts, seed=3) as inline, WorkerRenderer(*parts, seed=3) as worker:
+@pytest.fixture(scope="module")
+def worker(parts):
+    with WorkerRenderer(*parts, seed=3) as renderer:
+        yield renderer
+
+
+def test_inline_and_worker_give_equal_bytes_in_any_order(parts, worker):
+    with InlineRenderer(*parts, seed=3) as inline:
         expected = [as_bytes(job.result()) for job in requests(inline, 8)]
         jobs = requests(worker, 8)  # more than the worker has slots
         assert [as_bytes(job.result()) for job in reversed(jobs)] == expected[::-1]
@@ -62,13 +68,12 @@ def test_another_seed_gives_other_noise_on_the_same_world(parts):
     assert 0.5 < np.abs(a - b).mean() < 5.0
 
 
-def test_an_error_in_the_worker_is_raised_here_and_the_worker_lives_on(parts):
-    with WorkerRenderer(*parts, seed=3) as worker:
-        bad = worker.submit_lidar(P, Q, stamp_ns=0, counter=0, fog=0.5)
-        good = worker.submit_camera(P[0], Q[0], stamp_ns=7, counter=0)
-        with pytest.raises(RenderError, match="fog"):
-            bad.result()
-        assert good.result().stamp_ns == 7
+def test_an_error_in_the_worker_is_raised_here_and_the_worker_lives_on(worker):
+    bad = worker.submit_lidar(P, Q, stamp_ns=0, counter=0, fog=0.5)
+    good = worker.submit_camera(P[0], Q[0], stamp_ns=7, counter=0)
+    with pytest.raises(RenderError, match="fog"):
+        bad.result()
+    assert good.result().stamp_ns == 7
 
 
 def test_a_dead_worker_is_an_error_not_a_hang(parts):

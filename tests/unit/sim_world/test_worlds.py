@@ -11,6 +11,8 @@ from sim.sensors.caster import Caster
 from sim.world import load_world
 from sim.world.mesh import BRANCH, GROUND, LEAF
 from sim.world.model import BRANCH_CONE, TRUNK_CONE
+from sim.world.spec import PoissonSpec
+from sim.world.stand import scatter
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the shared real data are not here")
@@ -28,8 +30,8 @@ def rays_down(xy, height_m):
 
 @pytest.mark.parametrize("stems_per_ha", [100, 400, 1200])
 def test_the_number_of_stems_is_poisson_about_the_density(stems_per_ha):
-    options = {"stems_per_ha": stems_per_ha, "clearing_m": 0.0, "leaves": 0, "cell_m": 5.0}
-    counts = [len(load_world("poisson", seed=s, options=options).stems) for s in range(12)]
+    spec = PoissonSpec(stems_per_ha=stems_per_ha)
+    counts = [len(scatter(spec, np.random.default_rng(seed))) for seed in range(12)]
     expected = stems_per_ha * 1.44
     assert abs(np.mean(counts) - expected) < 4 * np.sqrt(expected / 12)
     assert 0.2 < np.var(counts, ddof=1) / expected < 3.0  # a Poisson count's variance is its mean
