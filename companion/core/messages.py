@@ -8,7 +8,7 @@ published: a node copies before it writes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Bytes2D = NDArray[np.uint8]
-message = dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False)
+def message(kind: type[T]) -> type[T]:
+    """Frozen, slotted, keywords only; compared by identity since arrays have no single truth."""
+    return dataclass(frozen=True, slots=True, kw_only=True, eq=False)(kind)
 
 
 # --- sensors ------------------------------------------------------------------------

@@ -1,0 +1,144 @@
+"""`companion fly`: one command flies a mission in the simulator, in lockstep."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+
+from companion.cli import simulation
+from companion.cli.outcome import Outcome, print_outcome, write_outcome
+from companion.config import Config, apply_overrides, load_config
+from companion.core.errors import InputError
+from companion.mission.model import Mission, parse_mission
+from companion.report.tracks import Tracks
+from companion.runtime.flight import Flight, LockstepConfig
+from companion.runtime.flight import Progress as Where
+from companion.runtime.flight_log import FlightLog
+from companion.stack import build
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """What is to be flown."""
+
+    mission_file: Path
+    mission: Mission
+    config: Config
+    overrides: tuple[str, ...]
+    world: str
+    seed: int
+    out: Path
+    workers: int
+    limit_s: float
+    log_all: bool
+
+
+def fly(
+    mission: Annotated[Path, typer.Argument(help="Mission YAML, such as missions/first_flight.yaml.")],
+    world: Annotated[str, typer.Option(help="World name, YAML file, or stems:FILE.csv.")] = "demo",
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes.")] = 0,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Override, such as tracking.lookahead_s=0.5; repeatable."),
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="Configuration YAML; holds only differences.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder [flights/<date>-<mission>].")] = None,
+    cores: Annotated[int, typer.Option(min=1, max=2, help="2 casts rays in a second process.")] = 2,
+    limit_s: Annotated[float, typer.Option(min=1, help="Simulated seconds after which to give up.")] = 900.0,
+    log_all: Annotated[bool, typer.Option(help="Store raw scans, images and maps in the log, too.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+) -> None:
+    """Fly MISSION in the simulator. Example: companion fly missions/first_flight.yaml --world poisson --seed 3
+
+    Exit code 0: completed without contact; 1: the flight failed; 2: wrong input.
+    """
+    overrides = tuple(set_ or ())
+    parsed = parse_mission(_read(mission), file=str(mission))
+    request = Request(
+        mission_file=mission,
+        mission=parsed,
+        config=_stack_config(config, overrides),
+        overrides=overrides,
+        world=world,
+        seed=seed,
+        out=out or Path("flights") / f"{date.today().isoformat()}-{parsed.name}",
+        workers=cores - 1,
+        limit_s=limit_s,
+        log_all=log_all,
+    )
+    console = Console(quiet=quiet or as_json, stderr=as_json)
+    outcome = fly_request(request, console)
+    print_outcome(outcome, console, as_json=as_json)
+    if not outcome.summary.completed:
+        raise typer.Exit(1)
+
+
+def fly_request(request: Request, console: Console) -> Outcome:
+    """Fly it, write everything into `request.out`, return what came out."""
+    request.out.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+    with simulation.open_simulator(
+        request.world, request.seed, request.overrides, request.workers, console
+    ) as sim:
+        tracks, log = Tracks(), FlightLog(request.out / "flight.log", store_all=request.log_all)
+        stack = build(request.config, request.mission, seed=request.seed)
+        flight = Flight([sim.node, *stack], request.config.lockstep, log=log, listeners=[tracks])
+        console.print(f"world and kernels ready in {time.perf_counter() - started:.1f} s")
+        started = time.perf_counter()
+        _run(flight, request, tracks, console)
+        wall_s = time.perf_counter() - started
+        log.close()
+        return write_outcome(request, flight, tracks, log, sim, stack, wall_s)
+
+
+def _run(flight: Flight, request: Request, tracks: Tracks, console: Console) -> None:
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[info]}"),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("flying", total=None, info="")
+        try:
+            for where in flight.run(limit_s=request.limit_s):
+                _show(bar, task, where, tracks)
+        except KeyboardInterrupt:
+            console.print("stopped by Ctrl-C: writing what was flown so far")
+
+
+def _show(bar: Progress, task: object, where: Where, tracks: Tracks) -> None:
+    if where.truth is None:
+        return
+    speed = float((where.truth.v_world @ where.truth.v_world) ** 0.5)
+    step, total, count = "starting", 1, 0
+    if where.mission is not None:
+        step, total, count = where.mission.step_id, where.mission.step_count, where.mission.step_index
+    near = min((m.clearance_m for m in tracks.truth[-50:]), default=float("nan"))
+    info = f"{where.time_s:6.1f} s simulated   {speed:4.1f} m/s   nearest branch {near:4.1f} m"
+    bar.update(task, description=step, total=max(total, 1), completed=count, info=info)  # type: ignore[arg-type]
+
+
+def _stack_config(file: Path | None, overrides: tuple[str, ...]) -> Config:
+    base = load_config(_read(file), file=str(file)) if file else Config()
+    return apply_overrides(base, [o for o in overrides if not o.startswith("sim.")])
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"cannot be read: {error.__class__.__name__}", file=str(file), valid="a YAML text file"
+        ) from error
+
+
+__all__ = ["LockstepConfig", "Request", "fly", "fly_request"]

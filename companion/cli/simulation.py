@@ -1,0 +1,69 @@
+"""Opens the simulator for a flight: world, renderer, node, and what the report wants of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+
+from companion.config import apply_overrides_to, dump_struct
+from companion.report.flight_figure import Scenery
+from sim.config import SimConfig
+from sim.node import SimNode
+from sim.sensors.render import InlineRenderer, Renderer, RenderSetup
+from sim.sensors.worker import WorkerRenderer
+from sim.world import World, load_world
+
+
+@dataclass(frozen=True, slots=True)
+class Simulator:
+    """A world with a vehicle in it, as a node."""
+
+    node: SimNode
+    world: World
+    config: SimConfig
+    renderer: Renderer
+
+    def scenery(self) -> Scenery:
+        """The world as the picture shows it."""
+        nx, ny = self.world.heights.shape
+        stems = self.world.stems
+        return Scenery(
+            stem_xy=np.column_stack([stems.x, stems.y]),
+            stem_diameter_m=stems.dbh_m,
+            stem_base_z=stems.z_ground,
+            stem_height_m=stems.height_m,
+            contour_x=self.world.origin_xy[0] + self.world.cell_m * np.arange(nx),
+            contour_y=self.world.origin_xy[1] + self.world.cell_m * np.arange(ny),
+            ground_z=self.world.heights,
+        )
+
+    def cpu_s(self, node_cpu_s: float) -> dict[str, float]:
+        """CPU seconds per part of the simulator; rendering may have run in its own process."""
+        return {"SimNode": node_cpu_s, **self.renderer.cpu_s}
+
+    def describe(self) -> str:
+        """The simulator's configuration as a YAML document of its own."""
+        return "---\n" + dump_struct(self.config, root="sim")
+
+
+@contextmanager
+def open_simulator(
+    world: str, seed: int, overrides: Sequence[str], workers: int, console: Console
+) -> Iterator[Simulator]:
+    """Build world and renderer, warm both up, and close what was opened."""
+    config = apply_overrides_to(
+        SimConfig(), [o.removeprefix("sim.") for o in overrides if o.startswith("sim.")]
+    )
+    with console.status(f"building world {world}, seed {seed}"):
+        built = load_world(world, seed=seed)
+    with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):
+        setup = RenderSetup(world=built, rig=config.rig, lidar=config.lidar, camera=config.camera, seed=seed)
+        renderer: Renderer = WorkerRenderer(setup) if workers else InlineRenderer(setup)
+        try:
+            yield Simulator(SimNode(config, built, renderer, seed=seed), built, config, renderer)
+        finally:
+            renderer.close()

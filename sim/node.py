@@ -1,0 +1,184 @@
+"""The simulated aircraft as a node: samples and MAVLink bytes out, MAVLink bytes in.
+
+At every tick of 2.5 ms the physics advances over the interval that has just passed, under the
+motor commands that the autopilot gave at its beginning; then the sensors are read, and the
+autopilot decides the next commands.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.core import topics
+from companion.core.messages import Array, GroundTruth, MavlinkBytes, RangeReading
+from companion.core.node import Node, Output, Outputs, every, on
+from sim.autopilot.autopilot import Autopilot
+from sim.autopilot.readings import Airframe
+from sim.autopilot.readings import GpsFix as ReceiverFix
+from sim.config import SimConfig
+from sim.sensors.baro import Baro
+from sim.sensors.gps import Gps, GpsFix
+from sim.sensors.imu import Imu
+from sim.sensors.lidar import knot_stamps
+from sim.sensors.range_finder import RangeFinder
+from sim.sensors.render import Renderer
+from sim.vehicle import Obstacles, Vehicle, VehicleParams, load_params
+from sim.world import World
+
+TICK_NS = 2_500_000  # 400 Hz
+PHYSICS_STEPS = 2
+IMU_TICKS, TRUTH_TICKS, SLOW_TICKS, GPS_TICKS = 2, 8, 20, 80  # 200, 50, 20 and 5 Hz
+
+
+class SimNode(Node):
+    """World, vehicle, sensors and autopilot in one state machine."""
+
+    publishes = (
+        topics.IMU, topics.LIDAR, topics.CAMERA, topics.RANGE, topics.BARO, topics.MAVLINK_RX, topics.TRUTH,
+    )  # fmt: skip
+
+    def __init__(self, config: SimConfig, world: World, renderer: Renderer, *, seed: int) -> None:
+        self.config, self.world = config, world
+        params = load_params()
+        self.vehicle = Vehicle(
+            params,
+            p_world=np.zeros(3),
+            yaw=math.radians(config.start_yaw_deg),
+            obstacles=_obstacles(world),
+            wind=config.wind,
+            seed=seed,
+        )
+        self.autopilot = Autopilot(config.autopilot, airframe=_airframe(params), seed=seed)
+        self._renderer = renderer
+        hover = params.hover_speed_rad_s
+        self._imu = Imu(config.imu, seed=seed, hover_speed_rad_s=hover)
+        self._autopilot_imu = Imu(config.autopilot_imu, seed=seed, hover_speed_rad_s=hover, stream=1)
+        self._baro = Baro(config.baro, seed=seed)
+        self._autopilot_baro = Baro(config.baro, seed=seed, stream=1)
+        self._gps = Gps(config.gps, seed=seed)
+        self._range = RangeFinder(config.range_finder, config.rig.range_finder, seed=seed)
+        self._command: Array = np.zeros(4)
+        self._tick = self._sweeps = self._frames = 0
+
+    @on(topics.MAVLINK_TX)
+    def receive(self, msg: MavlinkBytes) -> None:
+        """Bytes from the stack reach the autopilot."""
+        self.autopilot.receive(self.vehicle.time_ns, msg.data)
+
+    @every(hz=400)
+    def step(self, now_ns: int) -> Outputs:
+        """Advance to now, read what is due, let the autopilot decide."""
+        if now_ns > 0:
+            self.vehicle.step(self._command, PHYSICS_STEPS)
+            self._tick += 1
+            yield from self._sample(now_ns)
+            yield from self._fly(now_ns)
+        if self._tick % TRUTH_TICKS == 0:
+            yield topics.TRUTH(self._truth(now_ns))
+
+    def _sample(self, now_ns: int) -> Outputs:
+        late = self.config.latency
+        if self._tick % IMU_TICKS == 0:
+            force, rate = self.vehicle.mean_since(now_ns - IMU_TICKS * TICK_NS)
+            sample = self._imu.sample(now_ns, force, rate, self.vehicle.rotor_speed)
+            yield topics.IMU(sample, delay_ns=_ns(late.imu_ms))
+        if self._tick % SLOW_TICKS == 0:
+            yield topics.BARO(
+                self._baro.sample(now_ns, float(self.vehicle.p_world[2])), delay_ns=_ns(late.baro_ms)
+            )
+            yield topics.RANGE(self._ranged(now_ns), delay_ns=_ns(late.range_ms))
+        if now_ns >= round((self._sweeps + 1) * 1e9 / self.config.lidar.rate_hz):
+            yield self._sweep(now_ns, _ns(late.lidar_ms))
+        stamp_ns = round((self._frames + 1) * 1e9 / self.config.camera.rate_hz)
+        if now_ns >= stamp_ns:
+            yield self._frame(stamp_ns, _ns(late.camera_ms) + stamp_ns - now_ns)
+
+    def _sweep(self, now_ns: int, delay_ns: int) -> Output:
+        p, q = self.vehicle.poses_at(knot_stamps(self.config.lidar, now_ns))
+        sweep = self._renderer.submit_lidar(p, q, stamp_ns=now_ns, counter=self._sweeps)
+        self._sweeps += 1
+        return topics.LIDAR(sweep, delay_ns=delay_ns)
+
+    def _frame(self, stamp_ns: int, delay_ns: int) -> Output:
+        p, q = self.vehicle.poses_at(np.array([stamp_ns]))
+        frame = self._renderer.submit_camera(p[0], q[0], stamp_ns=stamp_ns, counter=self._frames)
+        self._frames += 1
+        return topics.CAMERA(frame, delay_ns=delay_ns)
+
+    def _ranged(self, now_ns: int) -> RangeReading:
+        v = self.vehicle
+        return self._range.sample(now_ns, v.p_world, v.q_world_body, self.world.range_to_surface)
+
+    def _fly(self, now_ns: int) -> Outputs:
+        v = self.vehicle
+        force, rate = v.mean_since(now_ns - TICK_NS)
+        own = self._autopilot_imu.sample(now_ns, force, rate, v.rotor_speed)
+        slow, gps_due = self._tick % SLOW_TICKS == 0, self._tick % GPS_TICKS == 0
+        self._command = self.autopilot.step(
+            now_ns,
+            imu=(own.angular_velocity_body, own.specific_force_body),
+            baro_altitude_m=self._autopilot_baro.sample(now_ns, float(v.p_world[2])).altitude_m
+            if slow
+            else None,
+            gps=_fix(self._gps.sample(now_ns, v.p_world, v.v_world)) if gps_due else None,
+            range_m=None,
+            battery_voltage=v.battery_voltage,
+        )
+        if data := self.autopilot.transmit(now_ns):
+            link_ns = _ns(self.config.latency.link_ms)
+            yield topics.MAVLINK_RX(MavlinkBytes(stamp_ns=now_ns + link_ns, data=data), delay_ns=link_ns)
+
+    def _truth(self, now_ns: int) -> GroundTruth:
+        v = self.vehicle
+        return GroundTruth(
+            stamp_ns=now_ns,
+            p_world=v.p_world,
+            q_world_body=v.q_world_body,
+            v_world=v.v_world,
+            clearance_m=v.take_min_clearance(),
+            contact=v.contact,
+            armed=self.autopilot.armed,
+            battery_fraction=v.battery_fraction,
+        )
+
+
+def _ns(milliseconds: float) -> int:
+    return round(milliseconds * 1e6)
+
+
+def _obstacles(world: World) -> Obstacles:
+    return Obstacles(
+        cones=world.cones,
+        kinds=world.kinds,
+        heights=world.heights,
+        origin_xy=world.origin_xy,
+        cell_m=world.cell_m,
+    )
+
+
+def _airframe(params: VehicleParams) -> Airframe:
+    """What one tells an autopilot of its aircraft: from the data sheet, not from the state."""
+    rotors, motor = params.rotors, params.motor
+    return Airframe(
+        mass_kg=params.airframe.mass_kg,
+        inertia_kg_m2=np.diag(np.array(params.airframe.inertia_kg_m2)),
+        rotor_xy_m=np.array(rotors.xyz_m)[:, :2],
+        rotor_spin=np.array(rotors.turning),
+        max_thrust_n=rotors.thrust_n_s2 * motor.speed_at_full_rad_s**2,
+        torque_per_thrust_m=rotors.torque_ratio_m,
+        motor_time_s=motor.time_constant_up_s,
+    )
+
+
+def _fix(fix: GpsFix | None) -> ReceiverFix | None:
+    """What the receiver hands to its autopilot."""
+    if fix is None:
+        return None
+    return ReceiverFix(
+        p_enu_m=tuple(fix.p_world),
+        v_enu=tuple(fix.v_world),
+        horizontal_sigma_m=fix.sigma_horizontal_m,
+        vertical_sigma_m=fix.sigma_vertical_m,
+    )
