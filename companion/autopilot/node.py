@@ -10,7 +10,7 @@ from companion.autopilot import codec, modes, timesync, vehicle
 from companion.autopilot.commands import CommandDesk, Verdict
 from companion.autopilot.outgoing import Target, odometry_message, setpoint_message
 from companion.autopilot.timesync import TimesyncConfig, TimesyncFilter
-from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.vehicle import State, Vehicle
 from companion.autopilot.wire import Frame, Parser
 from companion.core.messages import (
     CommandResult,
@@ -18,7 +18,6 @@ from companion.core.messages import (
     Odometry,
     Setpoint,
     VehicleCommand,
-    VehicleStatus,
 )
 from companion.core.node import Node, Output, Outputs, every, on
 from companion.core.topics import (
@@ -119,19 +118,20 @@ class AutopilotNode(Node):
         )
         self._intervals = _Intervals(config.interval_requests)
         self._ticks = 0
-        self._reported: tuple[object, ...] = ()
+        self._reported: State | None = None
         self._odometry_due_ns: int | None = None
         self._odometry_resets = -1
 
     @on(MAVLINK_RX)
     def on_bytes(self, received: MavlinkBytes) -> Outputs:
         """Read what the autopilot says; tell the stack at once when its state changed."""
+        heard = False
         for frame in self._parser.feed(received.data):
-            if (frame.system, frame.component) == self._target:
+            if frame.system == self._target.system and frame.component == self._target.component:
+                heard = True
                 yield from self._on_frame(frame, received.stamp_ns)
-        status = self._vehicle.status(received.stamp_ns)
-        if _state(status) != self._reported:
-            yield self._report(status)
+        if heard and self._vehicle.state(received.stamp_ns) != self._reported:
+            yield self._report(received.stamp_ns)
 
     def _on_frame(self, frame: Frame, now_ns: int) -> Outputs:
         message = codec.decode(frame)
@@ -210,7 +210,7 @@ class AutopilotNode(Node):
         yield from self._results(ended, now_ns)
         for msg_id, hz in self._intervals.missing(self._vehicle.flavour, connected):
             yield self._send(self._interval_request(msg_id, hz), now_ns)
-        yield self._report(self._vehicle.status(now_ns))
+        yield self._report(now_ns)
 
     def _interval_request(self, msg_id: int, hz: float) -> codec.CommandLong:
         system, component = self._target
@@ -219,9 +219,9 @@ class AutopilotNode(Node):
     def _send(self, message: codec.HotMessage, now_ns: int) -> Output:
         return MAVLINK_TX(MavlinkBytes(stamp_ns=now_ns, data=self._encoder.encode(message)))
 
-    def _report(self, status: VehicleStatus) -> Output:
-        self._reported = _state(status)
-        return VEHICLE(status)
+    def _report(self, now_ns: int) -> Output:
+        self._reported = self._vehicle.state(now_ns)
+        return VEHICLE(self._vehicle.status(now_ns))
 
     def _results(self, verdicts: list[Verdict] | list[Verdict | None], now_ns: int) -> Outputs:
         for verdict in verdicts:
@@ -231,11 +231,6 @@ class AutopilotNode(Node):
                         stamp_ns=now_ns, kind=verdict.kind, accepted=verdict.accepted, reason=verdict.reason
                     )
                 )
-
-
-def _state(status: VehicleStatus) -> tuple[object, ...]:
-    """What counts as a change; position and battery do not."""
-    return status.connected, status.armed, status.mode, status.landed, status.ready, status.text
 
 
 class _Intervals:

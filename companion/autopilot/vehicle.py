@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,17 @@ _PREARM_CHECK: Final = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
 _NEEDED: Final = 1 | 2 | 4 | 32  # attitude, horizontal and vertical velocity, height
 _POSITION: Final = 8 | 16  # relative or absolute
 _EKF_NO_AIDING: Final = 128 | 1024  # EKF_STATUS_REPORT only: constant position, uninitialised
+
+
+class State(NamedTuple):
+    """What counts as a change; position and battery do not. See VehicleStatus."""
+
+    connected: bool
+    armed: bool
+    mode: str
+    landed: bool
+    ready: bool
+    text: str
 
 
 class Vehicle:
@@ -106,6 +117,17 @@ class Vehicle:
             return False
         return not self._require_prearm or (self._prearm_ok and self._fresh(SYS_STATUS, now_ns, slow_ns))
 
+    def state(self, now_ns: int) -> State:
+        """The part of the status of which every change is news."""
+        return State(
+            self.connected(now_ns),
+            self._armed,
+            mode_name(self._custom_mode, self.flavour) if HEARTBEAT in self._heard else "",
+            self._landed(),
+            self._ready(now_ns),
+            self._text.newest,
+        )
+
     def _landed(self) -> bool:
         """Without EXTENDED_SYS_STATE, disarmed rotors are the evidence."""
         return self._landed_state == _ON_GROUND if self._landed_state else not self._armed
@@ -113,18 +135,19 @@ class Vehicle:
     def status(self, now_ns: int) -> VehicleStatus:
         """Everything in our frames; position and velocity are NaN once they are stale."""
         fresh = self._positioned(now_ns)
+        state = self.state(now_ns)
         status: VehicleStatus = freeze(
             VehicleStatus(
                 stamp_ns=now_ns,
-                connected=self.connected(now_ns),
-                armed=self._armed,
-                mode=mode_name(self._custom_mode, self.flavour) if HEARTBEAT in self._heard else "",
-                landed=self._landed(),
-                ready=self._ready(now_ns),
+                connected=state.connected,
+                armed=state.armed,
+                mode=state.mode,
+                landed=state.landed,
+                ready=state.ready,
                 battery_fraction=self._battery,
                 p_odom=_copy_or_nan(self._p_odom, fresh),
                 v_odom=_copy_or_nan(self._v_odom, fresh),
-                text=self._text.newest,
+                text=state.text,
             )
         )
         return status
