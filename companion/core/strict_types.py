@@ -58,7 +58,9 @@ def describe(kind: mi.Type, unit: str = "") -> str:
     if isinstance(kind, mi.LiteralType):
         return ", ".join(str(v) for v in kind.values)
     if isinstance(kind, mi.TupleType):
-        return f"a list of {len(kind.item_types)}: [{', '.join(describe(t, unit) for t in kind.item_types)}]"
+        items = [describe(t, unit) for t in kind.item_types]
+        alike = len(set(items)) == 1
+        return f"a list of {len(items)}{', each ' + items[0] if alike else ': ' + ', '.join(items)}"
     if isinstance(kind, mi.VarTupleType | mi.ListType):
         few = f"at least {kind.min_length} of " if kind.min_length else ""
         return f"a list of {few}{describe(kind.item_type, unit)}"
@@ -241,7 +243,8 @@ class Reader:
         try:
             return cls(**values)
         except InputError as error:
-            where = f"{path_text(path)}.{error.field}".strip(".")
+            own = error.field.rpartition(".")[2]  # a struct does not know where it stands
+            where = f"{path_text(path)}.{own}".strip(".")
             line = node.start_mark.line + 1 if self.file else 0
             raise InputError(
                 error.problem, file=self.file, line=line, field=where, valid=error.valid

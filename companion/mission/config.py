@@ -17,7 +17,9 @@ class MissionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     odometry_fresh_s: Seconds = 0.3
     """Older odometry does not count as ready."""
     command_retry_s: Seconds = 1.0
-    """Time until an unanswered or refused command is sent again."""
+    """Time until a refused command is sent again."""
+    command_answer_s: Seconds = 3.0
+    """Time until a command that changed nothing is sent again; the autopilot node repeats for 2 s itself."""
     command_attempts: Annotated[int, msgspec.Meta(ge=1, le=20)] = 6
     """Commands of one kind before giving up."""
     timeout_factor: Annotated[float, msgspec.Meta(ge=1)] = 4.0

@@ -34,7 +34,11 @@ class Executor:
 
     def __init__(self, mission: Mission, config: MissionConfig) -> None:
         self._mission, self._config = mission, config
-        self._requests = Requests(round(config.command_retry_s * 1e9), config.command_attempts)
+        self._requests = Requests(
+            retry_ns=round(config.command_retry_s * 1e9),
+            answer_ns=round(config.command_answer_s * 1e9),
+            attempts=config.command_attempts,
+        )
         self._timeouts_s = [
             set_or(s.timeout_s, config.timeout_factor * row.time_s + config.timeout_extra_s)
             for s, row in zip(mission.steps, estimate(mission), strict=True)

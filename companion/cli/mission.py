@@ -1,0 +1,76 @@
+"""`companion mission check`: a dry run of a mission file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from companion.core.errors import InputError
+from companion.mission.estimate import StepEstimate, estimate, total_time_s
+from companion.mission.model import Mission, parse_mission
+
+
+def check(
+    mission: Annotated[Path, typer.Argument(help="Mission YAML, such as missions/first_flight.yaml.")],
+    power_w: Annotated[float, typer.Option(min=1, help="Power in hover, W, for the energy.")] = 250.0,
+    battery_wh: Annotated[float, typer.Option(min=1, help="Full battery, Wh.")] = 77.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+) -> None:
+    """Check MISSION and say what it takes. Example: companion mission check missions/hop.yaml
+
+    Exit code 0: can be flown; 2: wrong, with file, line and the valid choices.
+    """
+    parsed = parse_mission(read_text(mission), file=str(mission))
+    rows = estimate(parsed)
+    share = total_time_s(rows) / 3600 * power_w / battery_wh
+    if as_json:
+        typer.echo(_json(parsed, rows, share))
+    elif not quiet:
+        _print(parsed, rows, share)
+
+
+def read_text(file: Path) -> str:
+    """The text of a file; raises InputError."""
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = (
+            "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror or "cannot be read"
+        )
+        raise InputError(why, file=str(file), valid="a YAML text file") from error
+
+
+def _json(mission: Mission, rows: tuple[StepEstimate, ...], share: float) -> str:
+    report = {
+        "name": mission.name,
+        "steps": [asdict(row) for row in rows],
+        "length_m": sum(row.length_m for row in rows),
+        "time_s": total_time_s(rows),
+        "battery_share": share,
+    }
+    return msgspec.json.encode(report).decode()
+
+
+def _print(mission: Mission, rows: tuple[StepEstimate, ...], share: float) -> None:
+    heads = ("step", "do", "goals", "length, m", "speed, m/s", "time, s", "x, m", "y, m", "height, m")
+    table = Table(title=f"{mission.name}: {mission.description}", title_justify="left")
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="left" if number < 2 else "right", no_wrap=True)
+    for row in rows:
+        spans = [f"{low:.0f} .. {high:.0f}" for low, high in zip(row.low[:2], row.high[:2], strict=True)]
+        figures = (f"{row.length_m:.1f}", f"{row.speed:.1f}", f"{row.time_s:.0f}")
+        height = f"{row.low[2]:.1f} .. {row.high[2]:.1f}"
+        table.add_row(row.id, row.do, str(row.goals), *figures, *spans, height)
+    console, reserve = Console(), mission.failsafe.battery.reserve
+    console.print(table)
+    total = f"{sum(r.length_m for r in rows):.0f} m, {total_time_s(rows):.0f} s"
+    console.print(f"{total}, about {share:.0%} of the battery; home frame, no obstacles, no wind")
+    if share > 1 - reserve:
+        console.print(f"[yellow]note:[/] leaves less than the reserve of {reserve:.0%}")
