@@ -49,7 +49,7 @@ class Camera:
         self.config, self.pinhole = config, pinhole
         self._p_body, self._R_body_cam = mount.p_body, mount.R_body_sensor
         self._caster, self._seed = caster, seed
-        self._classes, self._shade = mesh.classes, _shade_of(mesh)
+        self._classes, self._shade = mesh.classes.copy(), _shade_of(mesh)
         self._flat, self._starts = mip_levels(load_tile())
         self._vignette = _vignette(pinhole, config.vignetting)
         width, height = pinhole.width_px, pinhole.height_px

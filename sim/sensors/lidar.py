@@ -70,7 +70,7 @@ class Lidar:
     def __init__(self, config: LidarConfig, mount: Mount, caster: Caster, mesh: Mesh, seed: int) -> None:
         self.config = config
         self._p_body, self._R_body_sensor = mount.p_body, mount.R_body_sensor
-        self._caster, self._widths_m, self._seed = caster, mesh.widths_m, seed
+        self._caster, self._widths_m, self._seed = caster, mesh.widths_m.copy(), seed
         if config.pattern == "spin64":
             self._spin = spin_pattern(config.beams, config.columns, config.spin64_elevation_deg)
 
@@ -97,7 +97,9 @@ class Lidar:
         rays = np.empty((len(dirs), 6), np.float32)
         seen = np.empty(len(dirs), np.bool_)
         mount = (self._p_body, self._R_body_sensor, c.body_radius_m)
-        _aim(dirs, phases, np.asarray(p_world), np.asarray(q_world_body), mount, rays, seen)
+        _aim(
+            dirs, phases, np.array(p_world, np.float64), np.array(q_world_body, np.float64), mount, rays, seen
+        )
         ranges, triangles = self._cast(rays, dirs)
         self._through_thin(rays, ranges, triangles, uniform)
         loss = 1.0 - (1.0 - c.dropout) * (1.0 - lost_fraction)
@@ -265,7 +267,8 @@ def _pack(dirs, phases, ranges, seen, normal, noise, sweep):  # type: ignore[no-
             i += 1
         else:
             if j % stride == 0:
-                misses[j // stride] = dirs[n]
-                miss_ages[j // stride] = age
+                m = j // stride
+                misses[m, 0], misses[m, 1], misses[m, 2] = x, y, z
+                miss_ages[m] = age
             j += 1
     return points, ages, misses, miss_ages

@@ -83,6 +83,7 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
         xy, dbh_m, height_m = xy[keep], dbh_m[keep], height_m[keep]
     xy, low, high = xy - start, low - start, high - start
     heights, origin = _ground(spec, low, high, streams["terrain"])
+    heights.flags.writeable = origin.flags.writeable = False  # one type for the kernels
     z = heights_at(heights, origin, spec.cell_m, xy)
     stems = Stems(xy[:, 0].copy(), xy[:, 1].copy(), z, dbh_m, height_m)
     cones, kinds, leafy = _trees(spec, stems, streams)
