@@ -90,8 +90,8 @@ def _recordings(path: Path) -> list[Array]:
 
 
 def _high(samples: Array) -> Array:
-    filtered = sosfiltfilt(butter(4, CORNER_HZ, "high", fs=RATE_HZ, output="sos"), samples, axis=0)
-    return np.asarray(filtered)[EDGE:-EDGE]
+    filtered: Array = sosfiltfilt(butter(4, CORNER_HZ, "high", fs=RATE_HZ, output="sos"), samples, axis=0)
+    return filtered[EDGE:-EDGE]
 
 
 def _windows(samples: Array, size: int = 60) -> Array:
@@ -119,7 +119,8 @@ def _tone_share(samples: Array, size: int = 240, lines: int = 4) -> Array:
     power = np.sort(power[:, frequency > CORNER_HZ], axis=1)
     noise = _share_of_noise(power.shape[1], lines)
     share = power[:, -lines:].sum(axis=1) / power.sum(axis=1)
-    return np.maximum((share - noise) / (1.0 - noise), 0.0)
+    excess: Array = np.maximum((share - noise) / (1.0 - noise), 0.0)
+    return excess
 
 
 def _share_of_noise(bins: int, lines: int) -> float:
