@@ -13,6 +13,7 @@ from sim.world.mesh import BRANCH, GROUND, LEAF
 from sim.world.model import BRANCH_CONE, TRUNK_CONE
 from sim.world.spec import PoissonSpec
 from sim.world.stand import scatter
+from sim.world.world import WORLDS_DIR
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the shared real data are not here")
@@ -220,3 +221,23 @@ def test_a_yaml_file_may_name_a_stem_map_beside_it(tmp_path):
     (tmp_path / "w.yaml").write_text("kind: [\n")
     with pytest.raises(InputError, match=r"w\.yaml:\d"):
         load_world(str(tmp_path / "w.yaml"), seed=0)
+
+
+@pytest.mark.parametrize("file", sorted(WORLDS_DIR.glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_world_of_ours_loads_by_name_and_starts_free(file):
+    world = load_world(file.stem, seed=3)
+    assert world.name == file.stem
+    assert world.range_to_surface(np.array([0.0, 0.0, 30.0]), np.array([0.0, 0.0, -1.0])) == pytest.approx(
+        30.0
+    )
+    assert all(value.flags.writeable is False for value in (world.cones, world.heights, world.mesh.vertices))
+
+
+def test_a_slope_keeps_the_bounds_around_the_start():
+    world = load_world("poisson", seed=3, options={"slope_deg": 20.0, "size_m": 60.0})
+    x_min, y_min, x_max, y_max = world.bounds
+    assert (x_max - x_min, y_max - y_min) == (60.0, 60.0)
+    assert world.stems.x.min() >= x_min
+    assert world.stems.y.max() <= y_max
+    rise = world.ground_z(10.0, 0.0) - world.ground_z(-10.0, 0.0)
+    assert rise == pytest.approx(20 * np.tan(np.radians(20)), abs=0.8)
