@@ -1,0 +1,233 @@
+"""The one store of the map: an unbounded hash of 8^3 blocks of int8 log-odds."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid
+from companion.mapping.sensor_model import UNKNOWN, Steps
+
+i16, i64, u8, u64 = np.int16, np.int64, np.uint8, np.uint64
+_GROWTH = 4096  # blocks: 2 MB at a time, so that growing never stalls a scan
+_EMPTY = -1
+_EXPAND = np.array([sum(1 << (8 * b) for b in range(8) if v >> b & 1) for v in range(256)], np.uint64)
+
+
+class BlockStore:
+    """Blocks by position. Block (i, j, k) holds cells 8 * (i, j, k) up to + 7, z fastest.
+
+    `xyz` (capacity, 3) int32 and `log_odds` (capacity, 512) int8 grow in place: views of
+    them must not outlive a call. The first `count` rows are in use, in order of creation.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.xyz = np.zeros((_GROWTH, 3), np.int32)
+        self.log_odds = np.zeros((_GROWTH, CELLS), np.int8)
+        self.all_free = np.zeros(_GROWTH, np.uint8)  # 1: every cell is at the lower clamp
+        self._keys = np.full(4 * _GROWTH, _EMPTY, np.int64)
+        self._rows = np.zeros(4 * _GROWTH, np.int32)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes held, spare capacity included."""
+        arrays = (self.xyz, self.log_odds, self.all_free, self._keys, self._rows)
+        return sum(a.nbytes for a in arrays)
+
+    def fold(self, grid: RayGrid, steps: Steps) -> tuple[int, NDArray[np.int32]]:
+        """Add one scan's bits to the log-odds, and clear the bits.
+
+        Returns the number of blocks met and the positions (K, 3) of those in which a cell
+        changed between unknown, free and occupied.
+        """
+        met = grid.met()
+        self._reserve(self.count + len(met))
+        rows, before = np.empty(len(met), np.int64), self.count
+        table = (self._keys, self._rows, self.xyz)
+        self.count = int(_rows_of(met, grid.side, grid.corner, table, self.count, rows))
+        self.log_odds[before : self.count] = UNKNOWN
+        amounts = np.array([steps.hit, steps.miss, steps.lowest, steps.highest], np.int16)
+        changed = np.zeros(len(met), np.uint8)
+        words = (grid.free.reshape(-1, WORDS), grid.hit.reshape(-1, WORDS))
+        _fold(met, rows, words, (self.log_odds, self.all_free), (amounts, _EXPAND), changed)
+        return len(met), self.xyz[rows[changed != 0]]
+
+    def at(self, cells: NDArray[np.int64]) -> NDArray[np.int8]:
+        """Log-odds steps (N,) of cells (N, 3); UNKNOWN where no ray has been."""
+        found = np.empty(len(cells), np.int8)
+        _at(cells, (self._keys, self._rows), self.log_odds, found)
+        return found
+
+    def window(self, corner: NDArray[np.int64], states: NDArray[np.uint8]) -> None:
+        """Fill `states` (8a, 8b, 8c): 0 unknown, 1 free, 2 occupied; block `corner` first."""
+        _window(corner, (self._keys, self._rows), self.log_odds, states.view(np.uint64))
+
+    def load(self, xyz: NDArray[np.int32], log_odds: NDArray[np.int8], lowest: int) -> None:
+        """Replace everything by copies of blocks at `xyz` (N, 3), each of 512 `log_odds`."""
+        self.__init__()  # type: ignore[misc]
+        self._reserve(len(xyz))
+        self.xyz[: len(xyz)], self.log_odds[: len(xyz)] = xyz, log_odds
+        self.all_free[: len(xyz)] = np.all(log_odds == lowest, axis=1)
+        self.count = len(xyz)
+        _enter(self.xyz, self.count, self._keys, self._rows)
+
+    def _reserve(self, count: int) -> None:
+        """Make room for `count` blocks; the hash stays at most half full."""
+        capacity = len(self.xyz)
+        if count > capacity:
+            capacity = -(-count // _GROWTH) * _GROWTH
+            self.xyz.resize((capacity, 3), refcheck=False)  # realloc: large arrays move without a copy
+            self.log_odds.resize((capacity, CELLS), refcheck=False)
+            self.all_free.resize(capacity, refcheck=False)
+        if 2 * count > len(self._keys):
+            size = 1 << (2 * count - 1).bit_length()
+            self._keys, self._rows = np.full(size, _EMPTY, np.int64), np.zeros(size, np.int32)
+            _enter(self.xyz, self.count, self._keys, self._rows)
+
+
+@njit(cache=True, nogil=True)
+def _rows_of(met, side, corner, table, count, rows):  # type: ignore[no-untyped-def]
+    """Find or make the block of each scratch block; returns the new number of blocks."""
+    keys, values, xyz = table
+    for m in range(met.size):
+        i, rest = divmod(met[m], side * side)
+        j, k = divmod(rest, side)
+        x, y, z = i + corner[0], j + corner[1], k + corner[2]
+        slot = _slot(keys, x, y, z)
+        if keys[slot] == _EMPTY:
+            keys[slot] = _key(x, y, z)
+            values[slot] = count
+            xyz[count, 0], xyz[count, 1], xyz[count, 2] = x, y, z
+            count += 1
+        rows[m] = values[slot]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _enter(xyz, count, keys, values):  # type: ignore[no-untyped-def]
+    for row in range(count):
+        x, y, z = i64(xyz[row, 0]), i64(xyz[row, 1]), i64(xyz[row, 2])
+        slot = _slot(keys, x, y, z)
+        keys[slot] = _key(x, y, z)
+        values[slot] = row
+
+
+@njit(cache=True, nogil=True)
+def _fold(met, rows, words, blocks, tables, changed):  # type: ignore[no-untyped-def]
+    """One miss for each free bit without a hit bit, one hit for each hit bit; clears both."""
+    free, hit = words
+    log_odds, all_free = blocks
+    amounts, expand = tables
+    mask64 = np.empty(CELLS // 8, np.uint64)
+    mask = mask64.view(np.uint8)
+    for m in range(met.size):
+        f, h, row = free[met[m]], hit[met[m]], rows[m]
+        any_hit = u64(0)
+        for w in range(WORDS):
+            any_hit |= h[w]
+        if all_free[row] != 0 and any_hit == 0:  # nothing can change
+            f[:] = u64(0)
+            continue
+        for w in range(WORDS):
+            bits = f[w] & ~h[w]
+            f[w] = u64(0)
+            for b in range(8):
+                mask64[8 * w + b] = expand[(bits >> u64(8 * b)) & u64(255)]
+        changed[m], all_free[row] = _miss(log_odds[row], mask, amounts)
+        if any_hit != 0:
+            all_free[row] = u8(0)
+            changed[m] |= _hit(log_odds[row], h, amounts)
+
+
+@njit(cache=True, nogil=True)
+def _miss(cells, mask, amounts):  # type: ignore[no-untyped-def]
+    """Branch-free over the block; returns (a class changed, all cells at the lower clamp)."""
+    step, lowest = amounts[1], amounts[2]
+    unknown = np.int8(UNKNOWN)
+    differ, spread = np.int8(0), np.int8(0)
+    for c in range(CELLS):
+        old = cells[c]
+        base = i16(0) if old == unknown else i16(old)
+        less = i16(base + step)
+        less = lowest if less < lowest else less
+        new = np.int8(less) if mask[c] != u8(0) else old
+        cells[c] = new
+        flip = np.int8(old ^ new)  # its sign bit: occupied <-> free or unknown
+        differ = np.int8(differ | flip)
+        differ = np.int8(differ | (unknown if (old == unknown and new != unknown) else np.int8(0)))
+        spread = np.int8(spread | np.int8(new ^ np.int8(lowest)))
+    return u8(differ < 0), u8(spread == 0)
+
+
+@njit(cache=True, nogil=True)
+def _hit(cells, h, amounts):  # type: ignore[no-untyped-def]
+    """Cell by cell, since hits are few; clears the bits, returns whether a class changed."""
+    step, lowest, highest = i64(amounts[0]), i64(amounts[2]), i64(amounts[3])
+    differ = False
+    for w in range(WORDS):
+        bits = h[w]
+        h[w] = u64(0)
+        if bits == 0:
+            continue
+        for b in range(64):
+            if (bits >> u64(b)) & u64(1):
+                old = i64(cells[64 * w + b])
+                new = min(max((0 if old == UNKNOWN else old) + step, lowest), highest)
+                cells[64 * w + b] = new
+                differ |= old == UNKNOWN or (old >= 0) != (new >= 0)
+    return u8(differ)
+
+
+@njit(cache=True, nogil=True)
+def _at(cells, table, log_odds, found):  # type: ignore[no-untyped-def]
+    keys, values = table
+    for n in range(cells.shape[0]):
+        x, y, z = cells[n, 0], cells[n, 1], cells[n, 2]
+        slot = _slot(keys, x >> 3, y >> 3, z >> 3)
+        inside = (x & 7) * BLOCK * BLOCK + (y & 7) * BLOCK + (z & 7)
+        found[n] = UNKNOWN if keys[slot] == _EMPTY else log_odds[values[slot], inside]
+
+
+@njit(cache=True, nogil=True)
+def _window(corner, table, log_odds, lines):  # type: ignore[no-untyped-def]
+    """`lines` are the states along z, eight to a word."""
+    keys, values = table
+    block = np.empty(CELLS, np.uint8)
+    words = block.view(np.uint64)
+    unknown, zero = np.int8(UNKNOWN), np.int8(0)
+    for i in range(lines.shape[0] // BLOCK):
+        for j in range(lines.shape[1] // BLOCK):
+            for k in range(lines.shape[2]):
+                slot = _slot(keys, corner[0] + i, corner[1] + j, corner[2] + k)
+                known = keys[slot] != _EMPTY
+                if known:
+                    cells = log_odds[values[slot]]
+                    for c in range(CELLS):
+                        state = u8(2) if cells[c] >= zero else u8(1)
+                        block[c] = u8(0) if cells[c] == unknown else state
+                for line in range(BLOCK * BLOCK):
+                    lines[BLOCK * i + (line >> 3), BLOCK * j + (line & 7), k] = (
+                        words[line] if known else u64(0)
+                    )
+
+
+@njit(cache=True, nogil=True)
+def _slot(keys, x, y, z):  # type: ignore[no-untyped-def]
+    """Where block (x, y, z) is or would go. 2x2x4 neighbours share 16 slots in a row (locality)."""
+    key = _key(x, y, z)
+    mask = i64(keys.size - 1)
+    h = u64(x >> 1) * u64(0x9E3779B97F4A7C15)
+    h ^= u64(y >> 1) * u64(0xC2B2AE3D27D4EB4F) ^ u64(z >> 2) * u64(0x165667B19E3779F9)
+    h ^= h >> u64(29)
+    slot = (i64((h >> u64(20)) << u64(4)) | ((x & 1) << 3) | ((y & 1) << 2) | (z & 3)) & mask
+    while keys[slot] != key and keys[slot] != _EMPTY:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@njit(cache=True, nogil=True)
+def _key(x, y, z):  # type: ignore[no-untyped-def]
+    """21 bits per axis: 1,600 km of 0.2 m cells either way."""
+    return ((x & 0x1FFFFF) << 42) | ((y & 0x1FFFFF) << 21) | (z & 0x1FFFFF)

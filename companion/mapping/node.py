@@ -1,0 +1,98 @@
+"""Mapping: registered scans in, local maps out."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.geometry import rotation_from_quaternion
+from companion.core.messages import Array, RegisteredScan
+from companion.core.node import Node, Outputs, on
+from companion.core.rig import Rig
+from companion.core.topics import LOCAL_MAP, REGISTERED
+from companion.mapping.distance_field import DistanceField, FieldConfig
+from companion.mapping.free_volume import cells_around
+from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+
+_Metres = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
+
+
+class MappingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The map, the field around the vehicle, and what is free since the vehicle is there."""
+
+    voxels: VoxelMapConfig = VoxelMapConfig()
+    field: FieldConfig = FieldConfig()
+    map_every: Annotated[int, msgspec.Meta(ge=1)] = 2  # scans per local map
+    own_radius_m: _Metres = 0.35  # returns nearer to the body's origin are the vehicle itself
+    hull_radius_m: _Metres = 0.35  # sphere that is free at each scan: the vehicle fills it
+    start_free_radius_m: _Metres = 0.7  # sphere that is free at the first scan: nothing touches the rotors
+    start_free_height_m: Annotated[float, msgspec.Meta(ge=0.0, le=10.0)] = 3.0
+    """Column of that radius above the start that is free, too: the LiDAR cannot look straight up,
+    so the take-off stands on the word of whoever chose the place. 0: trust the LiDAR alone."""
+
+
+class MappingNode(Node):
+    """Takes in every registered scan; publishes the local map after every `map_every`-th.
+
+    `voxels` is the map, for saving at the end of a flight. `skipped_pose` and `skipped_stamp`
+    count scans that were left out: pose not finite, stamp not newer than the last.
+    """
+
+    publishes = (LOCAL_MAP,)
+
+    def __init__(self, config: MappingConfig, rig: Rig) -> None:
+        self.config = config
+        self.rig = rig
+        self.voxels = VoxelMap(config.voxels)
+        self.scans = self.skipped_pose = self.skipped_stamp = 0
+        self._field = DistanceField(config.field, resolution_m=config.voxels.resolution_m)
+        self._newest_ns = -1
+        self._compile()
+
+    @on(REGISTERED)
+    def insert(self, scan: RegisteredScan) -> Outputs:
+        """Take in one scan."""
+        if not _usable(scan):
+            self.skipped_pose += 1
+            return
+        if scan.stamp_ns <= self._newest_ns:
+            self.skipped_stamp += 1
+            return
+        self._newest_ns = scan.stamp_ns
+        R_odom_body = rotation_from_quaternion(scan.q_odom_body)
+        self.voxels.insert(
+            scan.points_body,
+            R_odom_body=R_odom_body,
+            p_odom=scan.p_odom,
+            origin_odom=scan.p_odom + R_odom_body @ scan.origin_body,
+            miss_dirs_body=scan.miss_dirs_body,
+            free_odom=self._filled_by_vehicle(scan.p_odom),
+            own_radius_m=self.config.own_radius_m,
+        )
+        if self.scans % self.config.map_every == 0:
+            yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
+        self.scans += 1
+
+    def _filled_by_vehicle(self, p_odom: Array) -> Array:
+        """Centres (K, 3) of the cells that are free because the vehicle is, or starts, there."""
+        cell_m = self.voxels.resolution_m
+        if self.scans > 0:
+            return cells_around(p_odom, radius_m=self.config.hull_radius_m, height_m=0.0, cell_m=cell_m)
+        radius_m = max(self.config.hull_radius_m, self.config.start_free_radius_m)
+        return cells_around(
+            p_odom, radius_m=radius_m, height_m=self.config.start_free_height_m, cell_m=cell_m
+        )
+
+    def _compile(self) -> None:
+        """Run every kernel once on nothing, so that the first scan does not wait for compilers."""
+        zero = np.zeros(3)
+        self.voxels.insert(np.empty((0, 3), np.float32), R_odom_body=np.eye(3), p_odom=zero, origin_odom=zero)
+        self._field.around(self.voxels, zero, 0)
+
+
+def _usable(scan: RegisteredScan) -> bool:
+    """Finite, near enough to have float precision, and with a unit quaternion."""
+    parts = np.concatenate([scan.p_odom, scan.origin_body])
+    return bool(np.all(np.abs(parts) < 1e4) and abs(float(scan.q_odom_body @ scan.q_odom_body) - 1.0) < 1e-3)

@@ -1,0 +1,205 @@
+"""Occupancy of the world from scans and poses: OctoMap's semantics, one update per voxel and scan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.core.errors import InputError
+from companion.core.messages import Array, Array32
+from companion.mapping.blocks import BlockStore
+from companion.mapping.rays import BLOCK, CELLS, RayGrid
+from companion.mapping.sensor_model import UNKNOWN, SensorModel, quantise
+
+UNKNOWN_CELL, FREE_CELL, OCCUPIED_CELL = 0, 1, 2  # as in core.messages.LocalMap.state
+_FARTHEST_M = 1e5  # where a float32 still tells centimetres, and far inside the hash's range
+_NO_POINTS = np.empty((0, 3))
+_NO_VECTORS = np.empty((0, 3), np.float32)
+_Metres = Annotated[float, msgspec.Meta(gt=0.0)]
+
+
+class VoxelMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Grain and reach of the map."""
+
+    resolution_m: Annotated[float, msgspec.Meta(ge=0.02, le=2.0)] = 0.2  # edge of a voxel
+    max_range_m: _Metres = 30.0  # longer rays clear up to here and hit nothing
+    miss_clear_range_m: _Metres = 15.0  # beams without return clear up to here; at most max_range_m
+    sensor: SensorModel = SensorModel()
+
+    def __post_init__(self) -> None:
+        if self.miss_clear_range_m > self.max_range_m:
+            raise InputError(
+                f"{self.miss_clear_range_m} m is farther than max_range_m",
+                field="mapping.voxels.miss_clear_range_m",
+                valid=f"up to {self.max_range_m} m",
+            )
+        if self.max_range_m > 200 * BLOCK * self.resolution_m:
+            raise InputError(
+                f"{self.max_range_m} m is too far for voxels of {self.resolution_m} m",
+                field="mapping.voxels.max_range_m",
+                valid=f"up to {200 * BLOCK * self.resolution_m:g} m",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Delta:
+    """What one scan did to the map."""
+
+    returns: int  # points that counted
+    misses: int  # beams without return that counted
+    dropped: int  # points and beams that were not finite, of no length, or on the own body
+    voxel_steps: int  # voxels crossed, each ray counted
+    blocks_met: int
+    changed_blocks: NDArray[np.int32]  # (K, 3), where a voxel changed between unknown, free, occupied
+
+
+class VoxelMap:
+    """Unbounded map of voxels in `odom`; a voxel is unknown, free or occupied.
+
+    >>> voxels = VoxelMap(VoxelMapConfig())
+    >>> delta = voxels.insert(points, R_odom_body=R, p_odom=p, origin_odom=p)
+    >>> voxels.classify(points + p)  # 0 unknown, 1 free, 2 occupied
+    """
+
+    def __init__(self, config: VoxelMapConfig) -> None:
+        self.config = config
+        self.resolution_m = config.resolution_m
+        self._steps = quantise(config.sensor)
+        self._blocks = BlockStore()
+        self._grid = RayGrid(config.resolution_m, config.max_range_m)
+
+    @property
+    def block_count(self) -> int:
+        """Blocks of 8^3 voxels that hold a known voxel."""
+        return self._blocks.count
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the map; the fixed scratch of insertion is not counted."""
+        return self._blocks.memory_bytes
+
+    def insert(
+        self,
+        points_body: Array32,
+        *,
+        R_odom_body: Array,
+        p_odom: Array,
+        origin_odom: Array,
+        miss_dirs_body: Array32 | None = None,
+        free_odom: Array = _NO_POINTS,
+        own_radius_m: float = 0.0,
+    ) -> Delta:
+        """Take in one scan.
+
+        Every voxel that a ray crosses on its way from `origin_odom` (3,) gets one miss, unless
+        it holds a return: then one hit. `points_body` (N, 3) are returns, m, and
+        `miss_dirs_body` (M, 3) directions of beams without return, both mapped to odom by
+        `R_odom_body` (3, 3); `p_odom` (3,) is the body. The voxels of `free_odom` (K, 3), m,
+        are free by other knowledge: one miss. Points nearer to the body's origin than
+        `own_radius_m`, and what is not finite, is dropped. Raises InputError when the pose is
+        not finite or farther than 100 km.
+        """
+        R, p, origin = (np.asarray(a, np.float64) for a in (R_odom_body, p_odom, origin_odom))
+        _check_pose(R=R, p_odom=p, origin_odom=origin)
+        points = _rows(points_body)
+        misses = _rows(_NO_VECTORS if miss_dirs_body is None else miss_dirs_body)
+        far_m, clear_m = self.config.max_range_m, self.config.miss_clear_range_m
+        self._grid.place(origin)
+        hit, steps = self._grid.cast(points, (R, p - origin, origin), (own_radius_m, far_m, False))
+        missed, more = self._grid.cast(misses, (R, np.zeros(3), origin), (0.0, clear_m, True))
+        self._grid.mark_free(free_odom)
+        met, changed = self._blocks.fold(self._grid, self._steps)
+        dropped = len(points) + len(misses) - hit - missed
+        return Delta(hit, missed, dropped, steps + more, met, changed)
+
+    def query(self, points_odom: Array) -> Array32:
+        """Log-odds (N,) of being occupied at points (N, 3), m; NaN: unknown."""
+        steps = self._at(points_odom)
+        return np.where(steps == UNKNOWN, np.nan, steps / self._steps.per_unit).astype(np.float32)
+
+    def classify(self, points_odom: Array) -> NDArray[np.uint8]:
+        """0 unknown, 1 free, 2 occupied (N,) at points (N, 3), m; what is not finite is unknown."""
+        steps = self._at(points_odom)
+        known = np.where(steps >= 0, OCCUPIED_CELL, FREE_CELL)
+        return np.where(steps == UNKNOWN, UNKNOWN_CELL, known).astype(np.uint8)
+
+    def occupied_centers(self) -> Array:
+        """Centres (K, 3) of all occupied voxels, m, in order of the map's growth."""
+        row, cell = np.nonzero(self._blocks.log_odds[: self._blocks.count] >= 0)
+        inside = np.stack([cell >> 6, (cell >> 3) & 7, cell & 7], axis=1)
+        return np.asarray((BLOCK * self._blocks.xyz[row] + inside + 0.5) * self.resolution_m)
+
+    def window(self, block_corner: NDArray[np.int64], states: NDArray[np.uint8]) -> None:
+        """Fill `states` (8a, 8b, 8c) with 0 unknown, 1 free, 2 occupied from a block corner on."""
+        self._blocks.window(block_corner, states)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Copies of everything that makes the map, ready for `numpy.savez`."""
+        count = self._blocks.count
+        model = self.config.sensor
+        return {
+            "resolution_m": np.array(self.resolution_m),
+            "sensor_model": np.array([model.hit, model.miss, model.lowest, model.highest]),
+            "block_xyz": self._blocks.xyz[:count].copy(),
+            "log_odds": self._blocks.log_odds[:count].copy(),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any], config: VoxelMapConfig) -> VoxelMap:
+        """A map from `to_arrays`; InputError when it does not fit `config` or is damaged."""
+        model = config.sensor
+        _check_same(arrays, "resolution_m", np.array(config.resolution_m))
+        _check_same(arrays, "sensor_model", np.array([model.hit, model.miss, model.lowest, model.highest]))
+        xyz, log_odds = (np.asarray(_entry(arrays, name)) for name in ("block_xyz", "log_odds"))
+        if xyz.shape != (len(xyz), 3) or log_odds.shape != (len(xyz), CELLS) or log_odds.dtype != np.int8:
+            raise InputError(
+                f"shapes {xyz.shape}, {log_odds.shape} {log_odds.dtype} are no map", field="log_odds"
+            )
+        if len(np.unique(xyz, axis=0)) != len(xyz):
+            raise InputError("a block is there twice", field="block_xyz")
+        voxels = cls(config)
+        voxels._blocks.load(xyz, log_odds, voxels._steps.lowest)
+        return voxels
+
+    def _at(self, points_odom: Array) -> NDArray[np.int8]:
+        points = np.asarray(points_odom, np.float64).reshape(-1, 3)
+        good = np.all(np.abs(points) < 10 * _FARTHEST_M, axis=1)
+        cells = np.floor(np.where(good[:, None], points, 0.0) / self.resolution_m).astype(np.int64)
+        return np.where(good, self._blocks.at(cells), np.int8(UNKNOWN))
+
+
+def _rows(vectors: Array32) -> Array32:
+    """A copy (N, 3), contiguous: a read-only array would be one more type to compile for."""
+    array = np.array(vectors, np.float32, order="C")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"shape {array.shape} is no list of vectors", field="points", valid="(N, 3)")
+    return array
+
+
+def _check_pose(**parts: Array) -> None:
+    for name, part in parts.items():
+        if not np.all(np.abs(part) < _FARTHEST_M):
+            raise InputError(
+                f"{part.tolist()} is no pose", field=name, valid=f"finite, within {_FARTHEST_M:g} m"
+            )
+
+
+def _entry(arrays: Mapping[str, Any], name: str) -> Any:
+    if name not in arrays:
+        raise InputError("missing in the stored map", field=name)
+    return arrays[name]
+
+
+def _check_same(arrays: Mapping[str, Any], name: str, wanted: Array) -> None:
+    stored = np.asarray(_entry(arrays, name))
+    if stored.shape != wanted.shape or not np.array_equal(stored, wanted):
+        raise InputError(
+            f"the stored map has {stored.tolist()}",
+            field=f"mapping.voxels.{name}",
+            valid=str(wanted.tolist()),
+        )
