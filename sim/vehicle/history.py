@@ -102,7 +102,8 @@ def _record(ring, step, before, x, moved_by):  # type: ignore[no-untyped-def]
     itself, so that an integrator without noise returns to it.
     """
     last, row = ring[(step - 1) % SIZE], ring[step % SIZE]
-    row[:3], row[3:7] = x[:3], x[6:10]
+    for i in range(7):
+        row[i] = x[i] if i < 3 else x[3 + i]
     aw, ax, ay, az = before[6], before[7], before[8], before[9]
     bw, bx, by, bz = x[6], x[7], x[8], x[9]
     w = aw * bw + ax * bx + ay * by + az * bz

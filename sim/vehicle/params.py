@@ -111,6 +111,11 @@ class VehicleParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return self.hover_speed_rad_s / self.motor.speed_at_full_rad_s
 
     @property
+    def max_rotor_thrust_n(self) -> float:
+        """Static thrust of one rotor at full command on a full battery without load; goes with u^2."""
+        return self.rotors.thrust_n_s2 * self.motor.speed_at_full_rad_s**2
+
+    @property
     def standing_height_m(self) -> float:
         """Height of the body's origin above flat ground when it stands on its legs."""
         sink = self.weight_n / (4 * self.gear.stiffness_n_m)

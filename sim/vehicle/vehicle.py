@@ -168,10 +168,12 @@ def _advance(  # type: ignore[no-untyped-def]
     before = work[5]
     for n in range(normals.shape[0]):
         scalars[_STEPS] += 1
-        before[:] = x
-        if scalars[_CONTACT] > 0:
-            x[3:6], x[10:] = 0.0, 0.0
-            before[3:6] = 0.0
+        stopped = scalars[_CONTACT] > 0
+        for i in range(x.shape[0]):
+            if stopped and (3 <= i < 6 or i >= 10):
+                x[i] = 0.0
+            before[i] = x[i]
+        if stopped:
             _record(ring, int(scalars[_STEPS]), before, x, STEP_S)
             continue
         _drain(model, x, scalars)

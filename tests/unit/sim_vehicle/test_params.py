@@ -44,8 +44,9 @@ def test_default_is_a_quad_of_2_kg_and_45_cm_that_can_fly() -> None:
     assert np.linalg.norm(hubs[0] - hubs[1]) == pytest.approx(0.45, abs=0.001)
     assert sum(params.rotors.turning) == 0
     np.testing.assert_allclose(hubs[:, :2].sum(axis=0), 0.0, atol=1e-12)
-    thrust = 4 * params.rotors.thrust_n_s2 * params.motor.speed_at_full_rad_s**2
-    assert 2.0 < thrust / params.weight_n < 3.0
+    assert 2.0 < 4 * params.max_rotor_thrust_n / params.weight_n < 3.0
+    hover_thrust_n = params.max_rotor_thrust_n * params.hover_command**2
+    assert 4 * hover_thrust_n == pytest.approx(params.weight_n)
     moments = np.linalg.eigvalsh(np.array(params.airframe.inertia_kg_m2))
     assert moments[2] < moments[0] + moments[1]  # a body of real mass
 
