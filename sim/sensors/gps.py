@@ -55,6 +55,11 @@ class Gps:
         self._rng = np.random.default_rng([seed, 6])
         self._multipath = self._rng.standard_normal(3)  # in units of its deviation
         self._last_ns = 0
+        self._jump: Array = np.zeros(3)
+
+    def jump(self, offset_world_m: Array) -> None:
+        """Fault: all later fixes are off by this (3,), m; zeros end it."""
+        self._jump = np.array(offset_world_m, dtype=np.float64)
 
     def sample(self, stamp_ns: int, p_world: Array, v_world: Array, *, canopy: float = 0.0) -> GpsFix | None:
         """A fix, or None when there is none; `canopy` is the share of sky covered, 0 to 1."""
@@ -70,7 +75,7 @@ class Gps:
         white = np.array([c.noise_horizontal_m, c.noise_horizontal_m, c.noise_vertical_m])
         return GpsFix(
             stamp_ns=stamp_ns,
-            p_world=p_world + axes * self._multipath + white * normals[3:6],
+            p_world=p_world + self._jump + axes * self._multipath + white * normals[3:6],
             v_world=v_world + c.noise_velocity_m_s * normals[6:],
             sigma_horizontal_m=math.hypot(wander, c.noise_horizontal_m),
             sigma_vertical_m=math.hypot(1.5 * wander, c.noise_vertical_m),

@@ -114,6 +114,11 @@ class Imu:
         """Present bias, rad/s, (3,)."""
         return self._bias[3:].copy()
 
+    def step_bias(self, accel_m_s2: Array, gyro_rad_s: Array) -> None:
+        """Fault: both biases jump by (3,) each."""
+        self._bias[:3] += accel_m_s2
+        self._bias[3:] += gyro_rad_s
+
     def sample(
         self, stamp_ns: int, specific_force_body: Array, angular_velocity_body: Array, rotor_speed: Array
     ) -> ImuSample:

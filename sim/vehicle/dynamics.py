@@ -143,7 +143,7 @@ def _aerodynamics(m, x, R, wind, ground_z):  # type: ignore[no-untyped-def]
         lift = m.k_lift * (u * u + v * v) * min(1.0, W / m.hover_speed)
         thrust = m.k_thrust * W * W - m.k_axial * W * w + lift
         rise = R[2, 0] * hub[0] + R[2, 1] * hub[1] + R[2, 2] * hub[2]
-        thrust *= _ground_effect(m.ground_radius, x[2] + rise - ground_z)
+        thrust *= m.health[i] * _ground_effect(m.ground_radius, x[2] + rise - ground_z)
         fx, fy = -m.k_rotor_drag * W * u, -m.k_rotor_drag * W * v
         load[0] += fx
         load[1] += fy

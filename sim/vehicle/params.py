@@ -149,7 +149,8 @@ MODEL = np.dtype(
         ("k_axial", "f8"), ("k_lift", "f8"), ("k_rotor_drag", "f8"), ("J_rotor", "f8"),
         ("ground_radius", "f8"), ("hover_speed", "f8"), ("tau_up", "f8"), ("tau_down", "f8"),
         ("full_speed", "f8"), ("efficiency", "f8"), ("capacity_c", "f8"), ("resistance", "f8"),
-        ("avionics_w", "f8"), ("volts", "f8", (11,)), ("leg", "f8", (4, 3)), ("k_leg", "f8"),
+        ("avionics_w", "f8"), ("volts", "f8", (11,)), ("full_volts", "f8"), ("health", "f8", (4,)),
+        ("leg", "f8", (4, 3)), ("k_leg", "f8"),
         ("c_leg", "f8"), ("friction", "f8"), ("touch_speed", "f8"), ("touch_cosine", "f8"),
     ]
 )  # fmt: skip
@@ -166,7 +167,8 @@ def pack(params: VehicleParams) -> NDArray[np.void]:
         r.axial_n_s2_m, r.translational_lift_n_s2_m2, r.drag_n_s2_m, r.inertia_kg_m2,
         r.ground_effect_radius_m, max(params.hover_speed_rad_s, 1.0), mo.time_constant_up_s,
         mo.time_constant_down_s, mo.speed_at_full_rad_s, mo.efficiency, 3600.0 * b.capacity_ah,
-        b.resistance_ohm, b.avionics_w, b.cells * np.array(b.cell_v), np.array(g.leg_xyz_m),
+        b.resistance_ohm, b.avionics_w, b.cells * np.array(b.cell_v), b.cells * b.cell_v[-1], np.ones(4),
+        np.array(g.leg_xyz_m),
         g.stiffness_n_m, g.damping_n_s_m, g.friction, g.touch_speed_max_m_s,
         math.cos(math.radians(g.touch_tilt_max_deg)),
     )  # fmt: skip

@@ -73,6 +73,23 @@ class Vehicle:
             near.grid.items, near.list, near.seen, self._anchors, self._scalars, self._ring, self._work,
         )  # fmt: skip
 
+    def weaken_rotor(self, rotor: int, loss: float) -> None:
+        """Fault: a chipped propeller loses this share of its thrust, 0 to 1; 0 mends it."""
+        if not (0 <= rotor < 4 and 0.0 <= loss <= 1.0):
+            raise InputError(f"{rotor}, {loss}", field="rotor, loss", valid="0..3, 0..1")
+        self._model["health"][0, rotor] = 1.0 - loss
+
+    def drop_cells(self, count: int) -> None:
+        """Fault: so many of the battery's cells give no voltage any more."""
+        b = self.params.battery
+        if not 0 <= count < b.cells:
+            raise InputError(str(count), field="cells", valid=f"0..{b.cells - 1}")
+        self._model["volts"][0] = (b.cells - count) * np.array(b.cell_v)
+
+    def set_wind(self, wind: WindConfig) -> None:
+        """Change the weather; gusts go on from where they are."""
+        self._wind = pack_wind(wind)
+
     @property
     def time_ns(self) -> int:
         """Simulated time since the start."""
@@ -178,7 +195,7 @@ def _advance(  # type: ignore[no-untyped-def]
             continue
         _drain(model, x, scalars)
         for i in range(4):
-            demand[i] = min(max(command[i], 0.0), 1.0) * m.full_speed * scalars[_VOLTS] / m.volts[10]
+            demand[i] = min(max(command[i], 0.0), 1.0) * m.full_speed * scalars[_VOLTS] / m.full_volts
         _ground_under(m, x, heights, field, ground_z)
         _blow(wind, gust, normals[n], x[2] - ground_z[0], x[3:6], STEP_S, air)
         _rk4(model, x, demand, air, ground_z, anchors, STEP_S, work)

@@ -101,6 +101,14 @@ def test_saturates_and_offsets_its_clock() -> None:
     assert s.stamp_ns == 1_150_000
 
 
+def test_bias_step_moves_the_readings() -> None:
+    imu, zero = Imu(silent(isolation=0.0), seed=1, hover_speed_rad_s=566.0), np.zeros(3)
+    imu.step_bias(np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, 0.02]))
+    s = imu.sample(0, REST, zero, np.zeros(4))
+    np.testing.assert_allclose(s.specific_force_body, [0.5, 0.0, 9.80665])
+    np.testing.assert_allclose(s.angular_velocity_body, [0, 0, 0.02])
+
+
 def test_same_seed_same_bytes_and_streams_differ() -> None:
     a, b, c = (record(ImuConfig(), 600, rotor=566.0, stream=s) for s in (0, 0, 1))
     assert a.tobytes() == b.tobytes() != c.tobytes()

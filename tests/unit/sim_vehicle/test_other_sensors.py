@@ -75,3 +75,13 @@ def test_gps_errors_are_as_large_as_it_claims(canopy: float, sigma: float) -> No
     assert good[0].sigma_horizontal_m == pytest.approx(sigma)
     assert np.std(errors[:, 2]) == pytest.approx(good[0].sigma_vertical_m, rel=0.05)
     assert np.std(np.array([f.v_world for f in good]) - v) == pytest.approx(0.1, rel=0.05)
+
+
+def test_gps_jump_shifts_the_fixes() -> None:
+    config = GpsConfig(denied=False)
+    a, b, zero = Gps(config, seed=1), Gps(config, seed=1), np.zeros(3)
+    b.jump(np.array([30.0, 0.0, 0.0]))
+    first, second = a.sample(0, zero, zero), b.sample(0, zero, zero)
+    assert first is not None
+    assert second is not None
+    np.testing.assert_allclose(second.p_world - first.p_world, [30.0, 0.0, 0.0])

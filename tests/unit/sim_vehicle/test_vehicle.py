@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from companion.core.errors import InputError
-from companion.core.geometry import exp_so3, quaternion_from_rotation, rotation_from_quaternion
+from companion.core.geometry import (
+    exp_so3,
+    quaternion_from_rotation,
+    quaternion_from_yaw,
+    rotation_from_quaternion,
+)
 from sim.vehicle import Obstacles, Vehicle, WindConfig, flat_ground, load_params
 from sim.vehicle.dynamics import STEP_NS
 from sim.vehicle.history import _record, new_ring, poses_at
@@ -234,3 +239,34 @@ def test_gusts_have_their_strength_and_length() -> None:
     lag = round(2.0 / dt)
     correlation = (fluctuation[lag:] * fluctuation[:-lag]).mean(axis=0) / fluctuation.var(axis=0)
     np.testing.assert_allclose(correlation, math.exp(-1), atol=0.1)
+
+
+def test_a_weak_rotor_makes_the_aircraft_fall_to_its_side() -> None:
+    v = vehicle(z=50.0)
+    v.weaken_rotor(0, 0.2)  # front right
+    fly(v, 0.3)
+    up = rotation_from_quaternion(v.q_world_body)[:, 2]
+    lean_body = rotation_from_quaternion(quaternion_from_yaw(0.3)).T @ up
+    assert lean_body[0] > 0.01
+    assert lean_body[1] < -0.01
+    with pytest.raises(InputError, match="rotor"):
+        v.weaken_rotor(4, 0.2)
+
+
+def test_a_lost_cell_costs_a_quarter_of_voltage_and_of_rotor_speed() -> None:
+    v = vehicle(z=500.0)
+    v.step(np.full(4, 0.6), 800)
+    volts, speed = v.battery_voltage, v.rotor_speed
+    v.drop_cells(1)
+    v.step(np.full(4, 0.6), 400)
+    assert v.battery_voltage / volts == pytest.approx(0.75, abs=0.02)
+    np.testing.assert_allclose(v.rotor_speed / speed, v.battery_voltage / volts, atol=0.01)
+
+
+def test_wind_can_change_in_flight() -> None:
+    v = vehicle(z=30.0)
+    fly(v, 0.5)
+    assert np.linalg.norm(v.v_world[:2]) < 1e-6
+    v.set_wind(WindConfig(mean_m_s=10.0))
+    fly(v, 0.5)
+    assert v.v_world[0] > 0.3
