@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from companion.core import topics
-from companion.core.messages import Array, GroundTruth, MavlinkBytes, RangeReading
-from companion.core.node import Node, Output, Outputs, every, on
+from companion.core.messages import Array, GroundTruth, LidarScan, MavlinkBytes, RangeReading
+from companion.core.node import Node, Output, Outputs, Pending, every, on
 from sim.autopilot.autopilot import Autopilot
 from sim.autopilot.readings import Airframe
 from sim.autopilot.readings import GpsFix as ReceiverFix
@@ -23,12 +23,13 @@ from sim.sensors.gps import Gps, GpsFix
 from sim.sensors.imu import Imu
 from sim.sensors.lidar import knot_stamps
 from sim.sensors.range_finder import RangeFinder
-from sim.sensors.render import Renderer
+from sim.sensors.render import JoinedSweep, Renderer
 from sim.vehicle import Obstacles, Vehicle, VehicleParams, load_params
 from sim.world import World
 
 TICK_NS = 2_500_000  # 400 Hz
 PHYSICS_STEPS = 2
+PIECES = 5  # of a sweep, so that a render worker keeps pace with it
 IMU_TICKS, TRUTH_TICKS, SLOW_TICKS, GPS_TICKS = 2, 8, 20, 80  # 200, 50, 20 and 5 Hz
 
 
@@ -61,6 +62,7 @@ class SimNode(Node):
         self._range = RangeFinder(config.range_finder, config.rig.range_finder, seed=seed)
         self._command: Array = np.zeros(4)
         self._tick = self._sweeps = self._frames = 0
+        self._pieces: tuple[Pending[LidarScan], ...] = ()
 
     @on(topics.MAVLINK_TX)
     def receive(self, msg: MavlinkBytes) -> None:
@@ -89,17 +91,26 @@ class SimNode(Node):
                 self._baro.sample(now_ns, float(self.vehicle.p_world[2])), delay_ns=_ns(late.baro_ms)
             )
             yield topics.RANGE(self._ranged(now_ns), delay_ns=_ns(late.range_ms))
-        if now_ns >= round((self._sweeps + 1) * 1e9 / self.config.lidar.rate_hz):
-            yield self._sweep(now_ns, _ns(late.lidar_ms))
+        yield from self._sweep(now_ns, _ns(late.lidar_ms))
         stamp_ns = round((self._frames + 1) * 1e9 / self.config.camera.rate_hz)
         if now_ns >= stamp_ns:
             yield self._frame(stamp_ns, _ns(late.camera_ms) + stamp_ns - now_ns)
 
-    def _sweep(self, now_ns: int, delay_ns: int) -> Output:
-        p, q = self.vehicle.poses_at(knot_stamps(self.config.lidar, now_ns))
-        sweep = self._renderer.submit_lidar(p, q, stamp_ns=now_ns, counter=self._sweeps)
-        self._sweeps += 1
-        return topics.LIDAR(sweep, delay_ns=delay_ns)
+    def _sweep(self, now_ns: int, delay_ns: int) -> Outputs:
+        """Submit the piece of the sweep that has just ended; publish the sweep after its last."""
+        sweep_ns = round(1e9 / self.config.lidar.rate_hz)
+        stamp_ns, part = (self._sweeps + 1) * sweep_ns, len(self._pieces)
+        if now_ns < stamp_ns - sweep_ns + (part + 1) * sweep_ns // PIECES:
+            return
+        knots = knot_stamps(self.config.lidar, stamp_ns, 21, part=part, parts=PIECES)
+        p, q = self.vehicle.poses_at(knots)
+        piece = self._renderer.submit_lidar(
+            p, q, stamp_ns=stamp_ns, counter=self._sweeps, part=part, parts=PIECES
+        )
+        self._pieces += (piece,)
+        if len(self._pieces) == PIECES:
+            yield topics.LIDAR(JoinedSweep(self._pieces), delay_ns=delay_ns + stamp_ns - now_ns)
+            self._sweeps, self._pieces = self._sweeps + 1, ()
 
     def _frame(self, stamp_ns: int, delay_ns: int) -> Output:
         p, q = self.vehicle.poses_at(np.array([stamp_ns]))

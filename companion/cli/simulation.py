@@ -13,8 +13,7 @@ from companion.config import apply_overrides_to, dump_struct
 from companion.report.flight_figure import Scenery
 from sim.config import SimConfig
 from sim.node import SimNode
-from sim.sensors.render import InlineRenderer, Renderer, RenderSetup
-from sim.sensors.worker import WorkerRenderer
+from sim.sensors.render import InlineRenderer, Renderer, WorkerRenderer
 from sim.world import World, load_world
 
 
@@ -61,8 +60,8 @@ def open_simulator(
     with console.status(f"building world {world}, seed {seed}"):
         built = load_world(world, seed=seed)
     with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):
-        setup = RenderSetup(world=built, rig=config.rig, lidar=config.lidar, camera=config.camera, seed=seed)
-        renderer: Renderer = WorkerRenderer(setup) if workers else InlineRenderer(setup)
+        kind = WorkerRenderer if workers else InlineRenderer
+        renderer: Renderer = kind(built, config.lidar, config.camera, config.rig, seed=seed)
         try:
             yield Simulator(SimNode(config, built, renderer, seed=seed), built, config, renderer)
         finally:

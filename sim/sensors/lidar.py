@@ -58,10 +58,13 @@ class LidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         return self.points if self.pattern == "mid360" else self.beams * self.columns
 
 
-def knot_stamps(config: LidarConfig, stamp_ns: int, knots: int = 101) -> NDArray[np.int64]:
-    """Times (knots,) at which a sweep that ends at `stamp_ns` needs body poses; evenly spaced."""
+def knot_stamps(
+    config: LidarConfig, stamp_ns: int, knots: int = 101, *, part: int = 0, parts: int = 1
+) -> NDArray[np.int64]:
+    """Times (knots,) at which (a piece of) a sweep that ends at `stamp_ns` needs body poses; evenly spaced."""
     sweep_ns = round(config.sweep_s * 1e9)
-    return stamp_ns - sweep_ns + np.arange(knots, dtype=np.int64) * sweep_ns // (knots - 1)
+    begin_ns = stamp_ns - sweep_ns + part * sweep_ns // parts
+    return begin_ns + np.arange(knots, dtype=np.int64) * (sweep_ns // parts) // (knots - 1)
 
 
 class Lidar:
@@ -81,25 +84,28 @@ class Lidar:
         *,
         stamp_ns: int,
         counter: int,
+        part: int = 0,
+        parts: int = 1,
         lost_fraction: float = 0.0,
         dust_fraction: float = 0.0,
     ) -> LidarScan:
-        """One sweep that ends at `stamp_ns`.
+        """One sweep that ends at `stamp_ns`, or the `part`-th of `parts` equal pieces of its time.
 
-        Body poses (K, 3) and (K, 4) at `knot_stamps`, K >= 2. The fractions are faults:
-        beams lost, and beams that dust 0.5 to 3 m away returns.
+        Body poses (K, 3) and (K, 4), K >= 2, at the `knot_stamps` of the piece. The fractions
+        are faults: beams lost, and beams that dust 0.5 to 3 m away returns.
         """
         c = self.config
         dirs, phases = self._pattern(counter)
-        rng = np.random.default_rng([self._seed, _STREAM, counter])
+        inside = slice(*(int(np.searchsorted(phases, k / parts)) for k in (part, part + 1)))
+        dirs, phases = dirs[inside], phases[inside]
+        rng = np.random.default_rng([self._seed, _STREAM, counter, part])
         uniform = rng.random((len(dirs), 3), dtype=np.float32)
         normal = rng.standard_normal((len(dirs), 3), dtype=np.float32)
         rays = np.empty((len(dirs), 6), np.float32)
         seen = np.empty(len(dirs), np.bool_)
         mount = (self._p_body, self._R_body_sensor, c.body_radius_m)
-        _aim(
-            dirs, phases, np.array(p_world, np.float64), np.array(q_world_body, np.float64), mount, rays, seen
-        )
+        knots = np.array(p_world, np.float64), np.array(q_world_body, np.float64)
+        _aim(dirs, phases * np.float32(parts) - np.float32(part), *knots, mount, rays, seen)
         ranges, triangles = self._cast(rays, dirs)
         self._through_thin(rays, ranges, triangles, uniform)
         loss = 1.0 - (1.0 - c.dropout) * (1.0 - lost_fraction)

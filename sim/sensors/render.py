@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Generic, Protocol, Self, TypeVar, cast
 
+import numpy as np
+
 from companion.core.messages import Array, CameraImage, LidarScan
 from companion.core.node import Pending
 from companion.core.rig import Rig
@@ -31,15 +33,15 @@ class Renderer(Protocol):
     cpu_s: dict[str, float]  # CPU seconds spent on "lidar" and "camera" so far, wherever
 
     def submit_lidar(
-        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
+        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **options: float
     ) -> Pending[LidarScan]:
         """A sweep that ends at the stamp, from body poses (K, 3), (K, 4) at `knot_stamps`.
 
-        Faults as in `Lidar.scan`: `lost_fraction`, `dust_fraction`.
+        Faults as in `Lidar.scan`: `lost_fraction`, `dust_fraction`; pieces, too: `part`, `parts`.
         """
 
     def submit_camera(
-        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
+        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **options: float
     ) -> Pending[CameraImage]:
         """A frame at the stamp, from the body pose (3,), (4,); the fault is `gain`, as in `Camera.frame`."""
 
@@ -58,22 +60,40 @@ class Done(Generic[M]):
         return self.value
 
 
+@dataclass(frozen=True)
+class JoinedSweep:
+    """A sweep whose pieces were submitted while it went on, so that a worker keeps pace with it."""
+
+    pieces: tuple[Pending[LidarScan], ...]
+
+    def result(self) -> LidarScan:
+        """All pieces as one message, in the order of time."""
+        scans = [piece.result() for piece in self.pieces]
+        return LidarScan(
+            stamp_ns=scans[-1].stamp_ns,
+            points_sensor=np.concatenate([s.points_sensor for s in scans]),
+            point_age_s=np.concatenate([s.point_age_s for s in scans]),
+            miss_dirs_sensor=np.concatenate([s.miss_dirs_sensor for s in scans]),
+            miss_age_s=np.concatenate([s.miss_age_s for s in scans]),
+        )
+
+
 class _Base(ABC):
     """The requests, written once; a subclass says how one is served."""
 
     def submit_lidar(
-        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
+        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **options: float
     ) -> Pending[LidarScan]:
         """See Renderer."""
         request = dict(p_world=p_world, q_world_body=q_world_body, stamp_ns=stamp_ns, counter=counter)
-        return cast("Pending[LidarScan]", self._submit("lidar", {**request, **faults}))
+        return cast("Pending[LidarScan]", self._submit("lidar", {**request, **options}))
 
     def submit_camera(
-        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **faults: float
+        self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **options: float
     ) -> Pending[CameraImage]:
         """See Renderer."""
         request = dict(p_world=p_world, q_world_body=q_world_body, stamp_ns=stamp_ns, counter=counter)
-        return cast("Pending[CameraImage]", self._submit("camera", {**request, **faults}))
+        return cast("Pending[CameraImage]", self._submit("camera", {**request, **options}))
 
     @abstractmethod
     def _submit(self, kind: str, request: dict[str, Any]) -> Pending[Any]: ...

@@ -20,7 +20,7 @@ from companion.core.messages import CameraImage, LidarScan, freeze
 from sim.sensors.scene import RenderSetup, Sensors
 
 Header = list[tuple[str, Any]]  # field -> value, or (dtype, shape) of an array in the slot
-_SLOTS = 8  # results that may wait to be fetched
+_SLOTS = 16  # results that may wait to be fetched
 _KINDS: dict[str, type[LidarScan] | type[CameraImage]] = {"lidar": LidarScan, "camera": CameraImage}
 
 
