@@ -31,7 +31,7 @@ from companion.autopilot.wire import (
 _STAMP = struct.Struct(">Q")
 _STAMP_SIZE: Final = 8
 _DAY_US: Final = 86_400_000_000
-_EPOCH_RANGE_US: Final = (0, 4_102_444_800_000_000)  # before 2100: the first stamp has no neighbour
+_EPOCH_END_US: Final = 4_102_444_800_000_000  # year 2100: the first stamp has no neighbour
 _GAP_MAX: Final = 127  # more: rather a repeated or overtaken number than so many lost messages
 _FOREIGN_MIN: Final = 10  # so many mismatches that one seed explains are no accident
 
@@ -147,8 +147,8 @@ def read_tlog(data: bytes) -> Iterator[Record | Damage]:
     at, last_us = 0, None
     while at < len(data):
         frame = read_frame(data, at + _STAMP_SIZE) if at + _STAMP_SIZE < len(data) else "more"
-        if isinstance(frame, Frame) and _plausible(data, at, last_us):
-            last_us = _STAMP.unpack_from(data, at)[0]
+        if isinstance(frame, Frame):
+            last_us = _stamp(data, at, at + _STAMP_SIZE + frame.size, last_us)
             yield Record(last_us, frame)
             at += _STAMP_SIZE + frame.size
             continue
@@ -157,12 +157,28 @@ def read_tlog(data: bytes) -> Iterator[Record | Damage]:
         at = following if following is not None else len(data)
 
 
+def _stamp(data: bytes, at: int, following: int, last_us: int | None) -> int:
+    """The stamp of an intact frame in its place, or the last one if this one is damaged.
+
+    Far from the last stamp it is damaged, unless the next one agrees with it: then the
+    clock was set in between.
+    """
+    stamp_us = int(_STAMP.unpack_from(data, at)[0])
+    if last_us is None and stamp_us <= _EPOCH_END_US:
+        return stamp_us
+    next_us = int(_STAMP.unpack_from(data, following)[0]) if following + 8 <= len(data) else stamp_us
+    if last_us is None:
+        return next_us
+    agrees = abs(stamp_us - last_us) <= _DAY_US or (
+        abs(stamp_us - next_us) <= _DAY_US and stamp_us <= _EPOCH_END_US
+    )
+    return stamp_us if agrees else last_us
+
+
 def _plausible(data: bytes, at: int, last_us: int | None) -> bool:
     """The stamp there lies within a day of the last one."""
     stamp_us = int(_STAMP.unpack_from(data, at)[0])
-    if last_us is None:
-        return _EPOCH_RANGE_US[0] <= stamp_us <= _EPOCH_RANGE_US[1]
-    return abs(stamp_us - last_us) <= _DAY_US
+    return stamp_us <= _EPOCH_END_US if last_us is None else abs(stamp_us - last_us) <= _DAY_US
 
 
 def _next_record(data: bytes, at: int, last_us: int | None) -> int | None:
