@@ -1,0 +1,33 @@
+"""What the estimation stage can be told."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from companion.estimation.camera import CameraConfig
+from companion.estimation.graph import GraphConfig
+from companion.estimation.lio import LioConfig
+from companion.estimation.ordering import OrderConfig
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class PropagatorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The odometry that control flies on."""
+
+    rate_hz: Positive = 100.0
+    position_inflation: Positive = 5.0  # of sigma: the map's own error is not modelled
+    drift_share: Annotated[float, msgspec.Meta(ge=0)] = 0.02  # of the way since the last scan, added to sigma
+    blind_after_s: Positive = 0.45  # without a scan: quality 0
+
+
+class EstimationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Front end, camera, order of arrival, propagator and graph."""
+
+    lio: LioConfig = LioConfig()
+    camera: CameraConfig = CameraConfig()
+    order: OrderConfig = OrderConfig()
+    propagator: PropagatorConfig = PropagatorConfig()
+    graph: GraphConfig = GraphConfig()

@@ -1,0 +1,98 @@
+"""The last seconds of IMU samples, and the pieces of them between two times."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.core.messages import Array, ImuSample
+
+_CAPACITY = 4096  # 20 s at 200 Hz
+_LEAP_NS = 1_000_000_000
+_LONGEST_STEP_S = 0.02  # longer gaps are bridged in steps of this length
+
+
+class ImuBuffer:
+    """Samples in stamp order; a bad or late one is refused and counted."""
+
+    def __init__(self) -> None:
+        self._stamps = np.empty(_CAPACITY, np.int64)
+        self._values = np.empty((_CAPACITY, 6))
+        self._count = 0
+        self._leap_ns = -(2**62)
+        self.refused = 0
+
+    def append(self, sample: ImuSample) -> bool:
+        """Take a sample; False if it is not finite or not newer than the last one."""
+        w, f = sample.angular_velocity_body, sample.specific_force_body
+        finite = np.isfinite(w).all() and np.isfinite(f).all()
+        if not finite or not self._is_next(sample.stamp_ns):
+            self.refused += 1
+            return False
+        if self._count == _CAPACITY:
+            half = _CAPACITY // 2
+            self._stamps[:half] = self._stamps[half:]
+            self._values[:half] = self._values[half:]
+            self._count = half
+        self._stamps[self._count] = sample.stamp_ns
+        self._values[self._count, :3] = w
+        self._values[self._count, 3:] = f
+        self._count += 1
+        return True
+
+    def _is_next(self, stamp_ns: int) -> bool:
+        """Newer, and not far ahead unless the one before said so, too: one wild stamp must not stop us."""
+        before, self._leap_ns = self._leap_ns, -(2**62)
+        if stamp_ns <= self.newest_ns:
+            return False
+        if not self._count or stamp_ns - self.newest_ns < _LEAP_NS or 0 < stamp_ns - before < _LEAP_NS:
+            return True
+        self._leap_ns = stamp_ns
+        return False
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest sample; the smallest integer if there is none."""
+        return int(self._stamps[self._count - 1]) if self._count else -(2**62)
+
+    @property
+    def newest_rate(self) -> Array:
+        """Angular velocity of the newest sample, rad/s, (3,), biased."""
+        return self._values[self._count - 1, :3].copy()
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether the buffer reaches back to a time."""
+        return self._count > 0 and int(self._stamps[0]) <= stamp_ns
+
+    def since(self, start_ns: int) -> Array:
+        """Rate and specific force of the samples after `start_ns`, (N, 6)."""
+        first = int(np.searchsorted(self._stamps[: self._count], start_ns, side="right"))
+        return self._values[first : self._count].copy()
+
+    def between(self, start_ns: int, end_ns: int) -> Array:
+        """Pieces that fill (start, end]: dt, rate, specific force, (N, 7).
+
+        A sample is the mean over the interval that ends at its stamp, so the pieces at both
+        ends are cut; what is missing at the end is bridged with the newest sample, and gaps
+        in between with the sample that follows them.
+        """
+        if end_ns <= start_ns or not self._count:
+            return np.empty((0, 7))
+        stamps = self._stamps[: self._count]
+        first = min(int(np.searchsorted(stamps, start_ns, side="right")), self._count - 1)
+        last = min(int(np.searchsorted(stamps, end_ns)), self._count - 1)
+        ends = np.minimum(stamps[first : last + 1], end_ns)
+        ends[-1] = end_ns
+        pieces = np.empty((len(ends), 7))
+        pieces[:, 0] = np.diff(ends, prepend=start_ns) * 1e-9
+        pieces[:, 1:] = self._values[first : last + 1]
+        return pieces if pieces[:, 0].max() <= _LONGEST_STEP_S else _split(pieces)
+
+
+def _split(pieces: Array) -> Array:
+    parts = np.ceil(pieces[:, 0] / _LONGEST_STEP_S).astype(np.int64)
+    split = np.repeat(pieces, parts, axis=0)
+    split[:, 0] /= np.repeat(parts, parts)
+    return split

@@ -1,0 +1,137 @@
+"""LiDAR-inertial odometry with an optional camera: the front end, without messages.
+
+lio = Lio.at_rest(imu_samples, LioConfig(), rig)
+lio.predict(imu_pieces)                   # (N, 7): dt, rate, specific force
+lio.update_lidar(points_sensor, age_s)    # returns what the scan said
+lio.filter.state.p                        # where we are, in odom
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.messages import Array, Array32, Bytes2D
+from companion.core.rig import Rig
+from companion.estimation.camera import CameraConfig, CameraTracker
+from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
+from companion.estimation.downsample import Thinner
+from companion.estimation.filter import Filter
+from companion.estimation.point_map import PointMap, PointMapConfig
+from companion.estimation.propagation import NODE, ImuNoise
+from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
+from companion.estimation.start import StartConfig, start_filter
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+_NODE_HISTORY = 160  # 0.8 s at 200 Hz
+
+
+class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The front end."""
+
+    noise: ImuNoise = ImuNoise()
+    start: StartConfig = StartConfig()
+    gate: ScanGate = ScanGate()
+    map: PointMapConfig = PointMapConfig()
+    plane: PlaneConfig = PlaneConfig()
+    thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # one point per voxel of this edge is registered
+    points: Count = 1500  # and at most so many
+    iterations: Count = 5
+    min_planes: Annotated[int, msgspec.Meta(ge=6)] = 20  # fewer: the scan is not used
+
+
+@dataclass(frozen=True, slots=True)
+class ScanResult:
+    """A deskewed scan, and what it said (None: nothing, e.g. the first)."""
+
+    points_body: Array32  # (N, 3)
+    normal: Normal | None
+
+
+class Lio:
+    """Filter, map, and the log of nodes that deskewing needs."""
+
+    def __init__(
+        self, start: Filter, config: LioConfig, rig: Rig, camera: CameraConfig | None = None
+    ) -> None:
+        self.filter, self.config = start, config
+        self.map = PointMap(config.map)
+        self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
+        self._nodes = np.empty((0, NODE))
+        self._thinner = Thinner()
+        self._densities = config.noise.densities
+        self._tracker = CameraTracker(camera or CameraConfig(), rig)
+
+    @classmethod
+    def at_rest(cls, samples: Array, config: LioConfig, rig: Rig, camera: CameraConfig | None = None) -> Lio:
+        """Start from rate and specific force of a vehicle that stands still, (N, 6)."""
+        return cls(start_filter(samples, config.start, t_s=0.0), config, rig, camera)
+
+    def predict(self, imu: Array) -> None:
+        """Advance through IMU pieces (N, 7): dt, rate, specific force."""
+        if len(imu):
+            nodes = self.filter.predict(imu, self._densities)
+            self._nodes = np.concatenate([self._nodes, nodes])[-_NODE_HISTORY:]
+
+    def update_lidar(self, points_sensor: Array32, age_s: Array32) -> ScanResult:
+        """Take a sweep (N, 3) that ends now; `age_s` (N,) is now minus each point's time."""
+        state = self.filter.state
+        points_body = deskew_points(
+            points_sensor,
+            age_s,
+            self._history(),
+            pose_end=(state.R, state.p),
+            t_end_s=self.filter.t_s,
+            mount=self._mount,
+            gate=self.config.gate,
+        )
+        normal = self._register(points_body) if self.map.voxels else None
+        spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
+        if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):
+            self.map.insert(spaced, state.R, state.p)
+        return ScanResult(points_body, normal)
+
+    def turn_directions(self, dirs_sensor: Array32, age_s: Array32) -> Array32:
+        """Directions (N, 3) of a sweep that ends now -> the body frame of now."""
+        return deskew_directions(
+            dirs_sensor,
+            age_s,
+            self._history(),
+            R_end=self.filter.state.R,
+            t_end_s=self.filter.t_s,
+            R_body_sensor=self._mount[0],
+        )
+
+    def update_camera(self, pixels: Bytes2D) -> Normal | None:
+        """Take an image exposed now, (H, W); None if no point could be tracked into it."""
+        before = self._pose()
+        normal = self._tracker.update(pixels, self.filter, self.map, self.config.plane)
+        move_nodes(self._nodes, before, self._pose())
+        return normal
+
+    def _register(self, points_body: Array32) -> Normal:
+        before = self._pose()
+        few = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
+        scan = PlaneRegistration(self.map, few, self.config.plane)
+        normal = self.filter.update(
+            scan.linearise, iterations=self.config.iterations, at_least=self.config.min_planes
+        )
+        move_nodes(self._nodes, before, self._pose())
+        return normal
+
+    def _is_known(self, normal: Normal) -> bool:
+        """Whether the map should have explained the scan; a nearly empty one cannot."""
+        return normal.offered > 0 and self.map.voxels > 4 * normal.offered
+
+    def _history(self) -> Array:
+        """The nodes passed, and the state of now, so that nothing is extrapolated from afar."""
+        now = np.zeros((1, NODE))
+        now[0, 0], now[0, 1:16] = self.filter.t_s, self.filter.state.x[:15]
+        return np.concatenate([self._nodes, now])
+
+    def _pose(self) -> tuple[Array, Array, Array]:
+        state = self.filter.state
+        return state.R.copy(), state.p.copy(), state.v.copy()

@@ -1,0 +1,226 @@
+"""Point-to-plane registration against a `PointMap`, as normal equations for a filter.
+
+Source: W. Xu et al., "FAST-LIO2", T-RO 2022, sec. V (five neighbours, plane test, range-scaled
+residual test); weights after Cauchy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from companion.core.messages import Array
+from companion.estimation.point_map import PointMap
+from companion.estimation.voxels import pack, slot_of
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Flags = NDArray[np.bool_]
+_LEVER = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # 1/m: rotation counts by its effect 10 m away
+
+
+class PlaneConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How planes are found and how far they are trusted."""
+
+    neighbour_m: Positive = 1.5  # the five neighbours lie within
+    flatness_m: Positive = 0.1  # and this close to their plane
+    sigma_m: Positive = 0.05  # of a point against its plane
+    cauchy: Positive = 4.0  # squared normalised residual that halves the square root of the weight
+    inflation: Positive = 3.0  # neighbouring points are not independent: information is divided by it
+    range_gate: Positive = 1 / 9  # residual, m, allowed per square root of range
+    search_again_m: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # motion that makes neighbours stale
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """0.5 dx' H dx - g' dx at a pose, dx = (theta_body, p_odom)."""
+
+    R: Array  # (3, 3), where it was linearised
+    p: Array  # (3,)
+    H: Array  # (6, 6)
+    g: Array  # (6,)
+    used: int
+    offered: int
+
+    @property
+    def weakest(self) -> float:
+        """Smallest eigenvalue of the scaled information, 0..1/3: near 0, a direction is blind."""
+        scale = float(np.trace(self.H[3:, 3:]))
+        return float(np.linalg.eigvalsh(_LEVER @ self.H @ _LEVER / scale)[0]) if scale > 0 else 0.0
+
+
+class PlaneRegistration:
+    """Linearises one scan at one pose after another, searching neighbours only when needed."""
+
+    def __init__(self, target: PointMap, points_body: Array, config: PlaneConfig) -> None:
+        self.points = points_body
+        self._map, self._config = target, config
+        self._planes = np.empty((len(points_body), 4))
+        self._valid = np.zeros(len(points_body), np.bool_)
+        self._searched: tuple[Array, Array] | None = None
+
+    def linearise(self, R: Array, p: Array) -> Normal:
+        """Normal equations at the pose (R_odom_body, p_odom)."""
+        if self._is_stale(R, p):
+            self._searched = (R.copy(), p.copy())
+            find_planes(self._map, self.points, R, p, self._config, self._planes, self._valid)
+        H, g = np.empty((6, 6)), np.empty(6)
+        c = self._config
+        limits = (1.0 / c.sigma_m**2, c.cauchy, c.range_gate)
+        used = _linearise(self.points, R, p, self._planes, self._valid, limits, H, g)
+        return Normal(R.copy(), p.copy(), H / c.inflation, g / c.inflation, used, len(self.points))
+
+    def _is_stale(self, R: Array, p: Array) -> bool:
+        if self._searched is None:
+            return True
+        moved = np.linalg.norm(p - self._searched[1]) + 3.0 * np.linalg.norm(R - self._searched[0])
+        return bool(moved > self._config.search_again_m)
+
+
+def find_planes(
+    target: PointMap,
+    points: Array,
+    R: Array,
+    p: Array,
+    config: PlaneConfig,
+    planes: Array,
+    valid: Flags,
+) -> int:
+    """Plane n.x + d = 0 of the five map points nearest to each R @ point + p, into `planes` (N, 4).
+
+    `valid` (N,) says where there is one; returns how many.
+    """
+    store = (target.keys, target.value, target.counts, target.pool)
+    limits = (target.config.voxel_m, config.neighbour_m**2, config.flatness_m)
+    return int(_find_planes(store, points, R, p, limits, planes, valid))
+
+
+@njit(cache=True, nogil=True)
+def _find_planes(store, points, R, p, limits, planes, valid):  # type: ignore[no-untyped-def]
+    near2, near = np.empty(5), np.empty((5, 3))
+    x, plane = np.empty(3), np.empty(4)
+    used = 0
+    for q in range(points.shape[0]):
+        for i in range(3):
+            x[i] = R[i, 0] * points[q, 0] + R[i, 1] * points[q, 1] + R[i, 2] * points[q, 2] + p[i]
+        for u in range(5):
+            near2[u] = limits[1]
+        valid[q] = _nearest_five(store, x, limits[0], near2, near) and _fit_plane(near, limits[2], plane)
+        if valid[q]:
+            for i in range(4):
+                planes[q, i] = plane[i]
+            used += 1
+    return used
+
+
+@njit(cache=True, nogil=True)
+def _nearest_five(store, x, voxel_m, near2, near):  # type: ignore[no-untyped-def]
+    """The 27 voxels around x, the centre first, skipping those that cannot hold a nearer point."""
+    keys, value, counts, pool = store
+    i0, j0, k0 = (
+        np.int64(np.floor(x[0] / voxel_m)),
+        np.int64(np.floor(x[1] / voxel_m)),
+        np.int64(np.floor(x[2] / voxel_m)),
+    )
+    gx, gy, gz = x[0] - i0 * voxel_m, x[1] - j0 * voxel_m, x[2] - k0 * voxel_m
+    found = 0
+    for o in range(27):
+        cell = 13 if o == 0 else (o - 1 if o <= 13 else o)
+        di, dj, dk = cell % 3 - 1, (cell // 3) % 3 - 1, cell // 9 - 1
+        ex = 0.0 if di == 0 else (gx if di < 0 else voxel_m - gx)
+        ey = 0.0 if dj == 0 else (gy if dj < 0 else voxel_m - gy)
+        ez = 0.0 if dk == 0 else (gz if dk < 0 else voxel_m - gz)
+        if ex * ex + ey * ey + ez * ez >= near2[4]:
+            continue
+        s = slot_of(keys, pack(i0 + di, j0 + dj, k0 + dk))
+        if keys[s] == 0:
+            continue
+        v = value[s]
+        for u in range(counts[v]):
+            dx, dy, dz = pool[v, u, 0] - x[0], pool[v, u, 1] - x[1], pool[v, u, 2] - x[2]
+            d = dx * dx + dy * dy + dz * dz
+            if d >= near2[4]:
+                continue
+            w = 4
+            while w > 0 and near2[w - 1] > d:
+                near2[w] = near2[w - 1]
+                near[w, 0], near[w, 1], near[w, 2] = near[w - 1, 0], near[w - 1, 1], near[w - 1, 2]
+                w -= 1
+            near2[w] = d
+            near[w, 0], near[w, 1], near[w, 2] = pool[v, u, 0], pool[v, u, 1], pool[v, u, 2]
+            found += 1
+    return found >= 5
+
+
+@njit(cache=True, nogil=True)
+def _fit_plane(near, flatness_m, plane):  # type: ignore[no-untyped-def]
+    """Smallest eigenvector of the scatter: power iterations on its adjugate, a multiple of its inverse."""
+    m0, m1, m2 = 0.0, 0.0, 0.0
+    for u in range(5):
+        m0, m1, m2 = m0 + near[u, 0] / 5, m1 + near[u, 1] / 5, m2 + near[u, 2] / 5
+    c00, c11, c22, c01, c02, c12 = 1e-6, 1e-6, 1e-6, 0.0, 0.0, 0.0
+    for u in range(5):
+        x, y, z = near[u, 0] - m0, near[u, 1] - m1, near[u, 2] - m2
+        c00, c11, c22 = c00 + x * x, c11 + y * y, c22 + z * z
+        c01, c02, c12 = c01 + x * y, c02 + x * z, c12 + y * z
+    d00, d11, d22 = c11 * c22 - c12 * c12, c00 * c22 - c02 * c02, c00 * c11 - c01 * c01
+    d01, d02, d12 = c02 * c12 - c01 * c22, c01 * c12 - c02 * c11, c01 * c02 - c00 * c12
+    if d00 >= d11 and d00 >= d22:
+        x, y, z = d00, d01, d02
+    elif d11 >= d22:
+        x, y, z = d01, d11, d12
+    else:
+        x, y, z = d02, d12, d22
+    for _ in range(3):
+        length = np.sqrt(x * x + y * y + z * z)
+        if length < 1e-30:
+            return False
+        x, y, z = x / length, y / length, z / length
+        x, y, z = d00 * x + d01 * y + d02 * z, d01 * x + d11 * y + d12 * z, d02 * x + d12 * y + d22 * z
+    length = np.sqrt(x * x + y * y + z * z)
+    if length < 1e-30:
+        return False
+    plane[0], plane[1], plane[2] = x / length, y / length, z / length
+    plane[3] = -(plane[0] * m0 + plane[1] * m1 + plane[2] * m2)
+    for u in range(5):
+        off = plane[0] * near[u, 0] + plane[1] * near[u, 1] + plane[2] * near[u, 2] + plane[3]
+        if abs(off) > flatness_m:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _linearise(points, R, p, planes, valid, limits, H, g):  # type: ignore[no-untyped-def]
+    """Residual r = n.(R x + p) + d; dr/dtheta = x cross R'n, dr/dp = n."""
+    information, cauchy, range_gate = limits
+    J = np.empty(6)
+    H[:], g[:] = 0.0, 0.0
+    used = 0
+    for q in range(points.shape[0]):
+        if not valid[q]:
+            continue
+        a, b, c = points[q, 0], points[q, 1], points[q, 2]
+        n0, n1, n2 = planes[q, 0], planes[q, 1], planes[q, 2]
+        u0 = R[0, 0] * n0 + R[1, 0] * n1 + R[2, 0] * n2
+        u1 = R[0, 1] * n0 + R[1, 1] * n1 + R[2, 1] * n2
+        u2 = R[0, 2] * n0 + R[1, 2] * n1 + R[2, 2] * n2
+        r = u0 * a + u1 * b + u2 * c + n0 * p[0] + n1 * p[1] + n2 * p[2] + planes[q, 3]
+        if abs(r) > range_gate * (a * a + b * b + c * c) ** 0.25:
+            continue
+        root = cauchy / (cauchy + r * r * information)
+        weight = root * root * information
+        J[0], J[1], J[2] = b * u2 - c * u1, c * u0 - a * u2, a * u1 - b * u0
+        J[3], J[4], J[5] = n0, n1, n2
+        for i in range(6):
+            g[i] -= weight * J[i] * r
+            for j in range(i, 6):
+                H[i, j] += weight * J[i] * J[j]
+        used += 1
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
+    return used
