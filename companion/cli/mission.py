@@ -8,6 +8,7 @@ from typing import Annotated
 
 import msgspec
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -41,9 +42,7 @@ def read_text(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        why = (
-            "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror or "cannot be read"
-        )
+        why = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror or "cannot be read"
         raise InputError(why, file=str(file), valid="a YAML text file") from error
 
 
@@ -59,18 +58,31 @@ def _json(mission: Mission, rows: tuple[StepEstimate, ...], share: float) -> str
 
 
 def _print(mission: Mission, rows: tuple[StepEstimate, ...], share: float) -> None:
-    heads = ("step", "do", "goals", "length, m", "speed, m/s", "time, s", "x, m", "y, m", "height, m")
-    table = Table(title=f"{mission.name}: {mission.description}", title_justify="left")
+    heads = ("step", "do", "goals", "length\nm", "time\ns", "x\nm", "y\nm", "height\nm")
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for number, head in enumerate(heads):
         table.add_column(head, justify="left" if number < 2 else "right", no_wrap=True)
     for row in rows:
-        spans = [f"{low:.0f} .. {high:.0f}" for low, high in zip(row.low[:2], row.high[:2], strict=True)]
-        figures = (f"{row.length_m:.1f}", f"{row.speed:.1f}", f"{row.time_s:.0f}")
-        height = f"{row.low[2]:.1f} .. {row.high[2]:.1f}"
+        spans = [f"{low:.0f}..{high:.0f}" for low, high in zip(row.low[:2], row.high[:2], strict=True)]
+        figures = (f"{row.length_m:.1f}", f"{row.time_s:.0f}")
+        height = f"{row.low[2]:.1f}..{row.high[2]:.1f}"
         table.add_row(row.id, row.do, str(row.goals), *figures, *spans, height)
     console, reserve = Console(), mission.failsafe.battery.reserve
+    console.print(f"[bold]{mission.name}[/] {mission.description}")
     console.print(table)
     total = f"{sum(r.length_m for r in rows):.0f} m, {total_time_s(rows):.0f} s"
     console.print(f"{total}, about {share:.0%} of the battery; home frame, no obstacles, no wind")
     if share > 1 - reserve:
         console.print(f"[yellow]note:[/] leaves less than the reserve of {reserve:.0%}")
+
+
+def table(
+    missions: Annotated[list[Path], typer.Argument(help="Mission files.")],
+) -> None:
+    """Print a Markdown table of MISSIONS. Example: companion mission table missions/*.yaml"""
+    typer.echo("| mission | what it does | steps | length, m | time, s |\n|---|---|--:|--:|--:|")
+    for file in sorted(missions):
+        parsed = parse_mission(read_text(file), file=str(file))
+        rows = estimate(parsed)
+        figures = f"{len(rows)} | {sum(r.length_m for r in rows):.0f} | {total_time_s(rows):.0f}"
+        typer.echo(f"| [{file.name}]({file.name}) | {parsed.description} | {figures} |")

@@ -46,7 +46,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 def describe(kind: mi.Type, unit: str = "") -> str:
     """What a type accepts, in words: 'a number > 0 in m'."""
-    kind = _bare(kind)
+    kind, unit = _bare(kind), unit_of("", kind) or unit
     if isinstance(kind, mi.FloatType | mi.IntType):
         words = "a whole number" if isinstance(kind, mi.IntType) else "a number"
         return " ".join(part for part in (words, _bounds(kind), f"in {unit}" if unit else "") if part)
@@ -103,7 +103,7 @@ class Reader:
 
     def read(self, node: yaml.Node, kind: mi.Type, path: Path, unit: str = "") -> Any:
         """The value of `node` as `kind`; raises InputError."""
-        kind = _bare(kind)
+        kind, unit = _bare(kind), unit_of("", kind) or unit
         method = _METHODS.get(type(kind))
         if method is None:
             raise TypeError(f"{path_text(path)}: strict YAML does not know {kind}")

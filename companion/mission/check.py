@@ -77,10 +77,11 @@ def _check_fence(document: Document, mission: Mission) -> None:
     _check_polygon(document, ("geofence", "inside"), fence.inside)
     if fence.alt[0] >= fence.alt[1]:
         raise document.error(("geofence", "alt"), "floor above ceiling", valid="[lowest, highest] in m")
-    if fence.depth_m(np.array([0.0, 0.0, mission.takeoff_alt_m])) <= 0 or fence.alt[0] > 0:
-        raise document.error(
-            ("geofence",), "the start lies outside", valid="a fence around (0, 0), floor <= 0"
-        )
+    if fence.alt[0] > -0.5:
+        problem = f"a floor at {fence.alt[0]:g} m would stop the takeoff"
+        raise document.error(("geofence", "alt", 0), problem, valid="-0.5 or less: the ground slopes")
+    if fence.depth_m(np.array([0.0, 0.0, mission.takeoff_alt_m])) <= 0:
+        raise document.error(("geofence",), "the takeoff lies outside", valid="a fence around (0, 0)")
 
 
 def _check_polygon(document: Document, path: Path, polygon: tuple[tuple[float, float], ...]) -> None:

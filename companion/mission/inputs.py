@@ -39,5 +39,6 @@ def taken_over(vehicle: VehicleStatus | None, ours: tuple[str, ...], *, may_disa
     if vehicle is None:
         return ""
     if not vehicle.armed:
-        return "" if may_disarm else "disarmed in flight"
+        where = "on the ground" if vehicle.landed else "in flight"
+        return "" if may_disarm else f"disarmed {where}"
     return "" if vehicle.mode in ours else f"pilot took over: mode {vehicle.mode}, not {ours[0]}"
