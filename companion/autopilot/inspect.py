@@ -169,9 +169,7 @@ def _stamp(data: bytes, at: int, following: int, last_us: int | None) -> int:
     next_us = int(_STAMP.unpack_from(data, following)[0]) if following + 8 <= len(data) else stamp_us
     if last_us is None:
         return next_us
-    agrees = abs(stamp_us - last_us) <= _DAY_US or (
-        abs(stamp_us - next_us) <= _DAY_US and stamp_us <= _EPOCH_END_US
-    )
+    agrees = abs(stamp_us - last_us) <= _DAY_US or (abs(stamp_us - next_us) <= _DAY_US and stamp_us <= _EPOCH_END_US)
     return stamp_us if agrees else last_us
 
 

@@ -6,11 +6,11 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 
-from companion.autopilot import codec, modes, timesync, vehicle
+from companion.autopilot import codec, modes, timesync
 from companion.autopilot.commands import CommandDesk, Verdict
 from companion.autopilot.outgoing import Target, odometry_message, setpoint_message
 from companion.autopilot.timesync import TimesyncConfig, TimesyncFilter
-from companion.autopilot.vehicle import State, Vehicle
+from companion.autopilot.vehicle import Id, State, Vehicle
 from companion.autopilot.wire import Frame, Parser
 from companion.core.messages import (
     CommandResult,
@@ -41,30 +41,19 @@ _ONBOARD_CONTROLLER: Final = 18  # MAV_TYPE
 _ACTIVE: Final = 4  # MAV_STATE
 _NEEDED_HZ: Final[dict[modes.Flavour, dict[int, float]]] = {
     "px4": {
-        vehicle.LOCAL_POSITION: 30.0,
-        vehicle.EXTENDED_SYS_STATE: 5.0,
-        vehicle.SYS_STATUS: 2.0,
-        vehicle.ESTIMATOR_STATUS: 1.0,
+        Id.LOCAL_POSITION_NED: 30.0,
+        Id.EXTENDED_SYS_STATE: 5.0,
+        Id.SYS_STATUS: 2.0,
+        Id.ESTIMATOR_STATUS: 1.0,
     },
     "ardupilot": {
-        vehicle.LOCAL_POSITION: 30.0,
-        vehicle.EXTENDED_SYS_STATE: 5.0,
-        vehicle.SYS_STATUS: 2.0,
-        vehicle.EKF_STATUS_REPORT: 2.0,
+        Id.LOCAL_POSITION_NED: 30.0,
+        Id.EXTENDED_SYS_STATE: 5.0,
+        Id.SYS_STATUS: 2.0,
+        Id.EKF_STATUS_REPORT: 2.0,
     },
 }
-_WANTED: Final = (
-    vehicle.HEARTBEAT,
-    vehicle.SYS_STATUS,
-    vehicle.LOCAL_POSITION,
-    _COMMAND_ACK,
-    _TIMESYNC,
-    vehicle.BATTERY_STATUS,
-    vehicle.EKF_STATUS_REPORT,
-    vehicle.ESTIMATOR_STATUS,
-    vehicle.EXTENDED_SYS_STATE,
-    vehicle.STATUSTEXT,
-)
+_WANTED: Final = (*Id, _COMMAND_ACK, _TIMESYNC)
 
 
 class AutopilotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -227,9 +216,7 @@ class AutopilotNode(Node):
         for verdict in verdicts:
             if verdict is not None:
                 yield COMMAND_RESULT(
-                    CommandResult(
-                        stamp_ns=now_ns, kind=verdict.kind, accepted=verdict.accepted, reason=verdict.reason
-                    )
+                    CommandResult(stamp_ns=now_ns, kind=verdict.kind, accepted=verdict.accepted, reason=verdict.reason)
                 )
 
 

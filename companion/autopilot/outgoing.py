@@ -88,9 +88,7 @@ def odometry_message(odometry: Odometry, *, stamp_ns: int, rate_variance: float)
     pose_variance = np.concatenate(
         [frames.swap_world_variance(o.pose_variance[3:]), frames.swap_body_variance(o.pose_variance[:3])]
     )
-    velocity_variance = np.append(
-        frames.swap_body_variance(R_body_odom**2 @ o.velocity_variance), [rate_variance] * 3
-    )
+    velocity_variance = np.append(frames.swap_body_variance(R_body_odom**2 @ o.velocity_variance), [rate_variance] * 3)
     return OdometryNed._make(
         (
             stamp_ns // 1000,

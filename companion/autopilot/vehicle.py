@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -10,14 +11,19 @@ from companion.autopilot import frames
 from companion.autopilot.modes import AUTOPILOT_ARDUPILOT, Flavour, mode_name
 from companion.core.messages import Array, VehicleStatus, freeze
 
-HEARTBEAT: Final = 0
-SYS_STATUS: Final = 1
-LOCAL_POSITION: Final = 32
-BATTERY_STATUS: Final = 147
-EKF_STATUS_REPORT: Final = 193  # ArduPilot's
-ESTIMATOR_STATUS: Final = 230  # PX4's
-EXTENDED_SYS_STATE: Final = 245
-STATUSTEXT: Final = 253
+
+class Id(IntEnum):
+    """Ids of the messages that tell the vehicle's state."""
+
+    HEARTBEAT = 0
+    SYS_STATUS = 1
+    LOCAL_POSITION_NED = 32
+    BATTERY_STATUS = 147
+    EKF_STATUS_REPORT = 193  # ArduPilot's
+    ESTIMATOR_STATUS = 230  # PX4's
+    EXTENDED_SYS_STATE = 245
+    STATUSTEXT = 253
+
 
 _ARMED: Final = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _NOT_AN_AUTOPILOT: Final = 8  # MAV_AUTOPILOT_INVALID
@@ -61,23 +67,23 @@ class Vehicle:
     def take(self, msg_id: int, message: Any, now_ns: int) -> None:
         """Note one message; ids without meaning here are ignored."""
         match msg_id:
-            case 0:
+            case Id.HEARTBEAT:
                 if not self._take_heartbeat(message):
                     return
-            case 1:
+            case Id.SYS_STATUS:
                 self._prearm_ok = bool(message.onboard_control_sensors_health & _PREARM_CHECK)
                 self._take_battery(message.battery_remaining)
-            case 32:
+            case Id.LOCAL_POSITION_NED:
                 self._p_odom = frames.swap_world(np.array(message[1:4]))
                 self._v_odom = frames.swap_world(np.array(message[4:7]))
-            case 147:
+            case Id.BATTERY_STATUS:
                 if message.id == 0:
                     self._take_battery(message.battery_remaining)
-            case 193 | 230:
+            case Id.EKF_STATUS_REPORT | Id.ESTIMATOR_STATUS:
                 self._take_estimator(msg_id, message.flags)
-            case 245:
+            case Id.EXTENDED_SYS_STATE:
                 self._landed_state = message.landed_state
-            case 253:
+            case Id.STATUSTEXT:
                 self._text.take(message)
         self._heard[msg_id] = now_ns
 
@@ -94,35 +100,35 @@ class Vehicle:
             self._battery = percent / 100
 
     def _take_estimator(self, msg_id: int, flags: int) -> None:
-        aided = msg_id == ESTIMATOR_STATUS or not flags & _EKF_NO_AIDING
+        aided = msg_id == Id.ESTIMATOR_STATUS or not flags & _EKF_NO_AIDING
         self._estimator_ok = flags & _NEEDED == _NEEDED and bool(flags & _POSITION) and aided
 
     def connected(self, now_ns: int) -> bool:
         """A heartbeat came within the timeout."""
-        return self._fresh(HEARTBEAT, now_ns, self._heartbeat_timeout_ns)
+        return self._fresh(Id.HEARTBEAT, now_ns, self._heartbeat_timeout_ns)
 
     def _fresh(self, msg_id: int, now_ns: int, timeout_ns: int) -> bool:
         heard = self._heard.get(msg_id)
         return heard is not None and now_ns - heard <= timeout_ns
 
     def _positioned(self, now_ns: int) -> bool:
-        return self._fresh(LOCAL_POSITION, now_ns, self._data_timeout_ns)
+        return self._fresh(Id.LOCAL_POSITION_NED, now_ns, self._data_timeout_ns)
 
     def _ready(self, now_ns: int) -> bool:
         if not self.connected(now_ns) or not self._positioned(now_ns) or not self._estimator_ok:
             return False
         slow_ns = 3 * self._data_timeout_ns  # sent at 1 Hz
-        estimator = ESTIMATOR_STATUS if self.flavour == "px4" else EKF_STATUS_REPORT
+        estimator = Id.ESTIMATOR_STATUS if self.flavour == "px4" else Id.EKF_STATUS_REPORT
         if not self._fresh(estimator, now_ns, slow_ns):
             return False
-        return not self._require_prearm or (self._prearm_ok and self._fresh(SYS_STATUS, now_ns, slow_ns))
+        return not self._require_prearm or (self._prearm_ok and self._fresh(Id.SYS_STATUS, now_ns, slow_ns))
 
     def state(self, now_ns: int) -> State:
         """The part of the status of which every change is news."""
         return State(
             self.connected(now_ns),
             self._armed,
-            mode_name(self._custom_mode, self.flavour) if HEARTBEAT in self._heard else "",
+            mode_name(self._custom_mode, self.flavour) if Id.HEARTBEAT in self._heard else "",
             self._landed(),
             self._ready(now_ns),
             self._text.newest,
