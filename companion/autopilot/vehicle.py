@@ -97,7 +97,7 @@ class Vehicle:
 
     def _take_battery(self, percent: int) -> None:
         if percent >= 0:  # -1: not measured
-            self._battery = percent / 100
+            self._battery = min(percent / 100, 1.0)
 
     def _take_estimator(self, msg_id: int, flags: int) -> None:
         aided = msg_id == Id.ESTIMATOR_STATUS or not flags & _EKF_NO_AIDING

@@ -114,9 +114,7 @@ def test_the_radio_logs_corrupt_pieces_are_frames_of_an_older_definition():
 
 
 @needs_logs
-@pytest.mark.parametrize(
-    "name, messages, unknown", [("px4_offboard", 76_225, 146), ("arducopter_guided", 18_097, 0)]
-)
+@pytest.mark.parametrize("name, messages, unknown", [("px4_offboard", 76_225, 146), ("arducopter_guided", 18_097, 0)])
 def test_both_direction_logs_are_read_whole(name, messages, unknown):
     report = inspect_tlog(gzip.decompress((LOGS / f"{name}_both_directions.tlog.gz").read_bytes()))
     assert (report.messages, report.unknown, report.corrupt_pieces) == (messages, unknown, 0)

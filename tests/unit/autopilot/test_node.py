@@ -208,9 +208,7 @@ def test_heartbeat_at_one_hz_as_onboard_controller():
 
 def setpoint(stamp_ns=S):
     nan = np.full(3, math.nan)
-    return Setpoint(
-        stamp_ns=stamp_ns, p_odom=np.array([1.0, 2, 3]), v_odom=nan, a_odom=nan, yaw=0.0, yaw_rate=math.nan
-    )
+    return Setpoint(stamp_ns=stamp_ns, p_odom=np.array([1.0, 2, 3]), v_odom=nan, a_odom=nan, yaw=0.0, yaw_rate=math.nan)
 
 
 def test_one_setpoint_one_message_and_none_from_the_clock():
@@ -405,3 +403,19 @@ def test_arducopter_flight_reads_as_it_was_flown():
     modes = [state[2] for _, state in changes]
     assert "OFFBOARD" in modes and any(state[1] and state[2] == "OFFBOARD" for _, state in changes)
     assert any(state[1] and not state[3] for _, state in changes)
+
+
+def test_senseless_content_from_the_target_breaks_nothing():
+    encoder = codec.Encoder(system=1, component=1)
+    rng = np.random.default_rng(12)
+    flight = ready_flight()
+    flight.feed(VEHICLE_COMMAND, VehicleCommand(stamp_ns=S, kind="arm"))
+    for i in range(4000):
+        now = S + i * 10 * MS
+        msg_id = int(rng.choice([0, 1, 32, 77, 111, 147, 193, 230, 245, 253]))
+        data = encoder.frame(msg_id, rng.bytes(int(rng.integers(1, 256))))
+        flight.feed(MAVLINK_RX, MavlinkBytes(stamp_ns=now, data=data))
+        if i % 10 == 0:
+            flight.tick(now).feed(SETPOINT, setpoint(now)).feed(ODOMETRY, odometry(now))
+    assert 0.0 <= flight.status.battery_fraction <= 1.0
+    assert len(flight.sent(codec.SetPositionTarget)) == 400
