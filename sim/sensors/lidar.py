@@ -74,6 +74,8 @@ class Lidar:
         self.config = config
         self._p_body, self._R_body_sensor = mount.p_body, mount.R_body_sensor
         self._caster, self._widths_m, self._seed = caster, mesh.widths_m.copy(), seed
+        nothing = np.empty((0, 3), np.float32)
+        self._rosette: tuple[int, tuple[Array32, Array32]] = (-1, (nothing, nothing[:, 0]))
         if config.pattern == "spin64":
             self._spin = spin_pattern(config.beams, config.columns, config.spin64_elevation_deg)
 
@@ -128,7 +130,9 @@ class Lidar:
         c = self.config
         if c.pattern == "spin64":
             return self._spin
-        return rosette_pattern(c.points, c.sweep_s, counter, c.mid360_elevation_deg)
+        if self._rosette[0] != counter:  # the pieces of a sweep share its pattern
+            self._rosette = (counter, rosette_pattern(c.points, c.sweep_s, counter, c.mid360_elevation_deg))
+        return self._rosette[1]
 
     def _cast(self, rays: Array32, dirs: Array32) -> tuple[Array32, NDArray[np.uint32]]:
         """First hits; cast by azimuth, as neighbours share their way through the scene (25 % faster)."""

@@ -57,7 +57,9 @@ def test_every_message_begins_with_a_stamp():
 def test_no_stage_hears_the_truth():
     from companion.core.node import Node
 
-    for package in STAGES:
+    nodes = [s for s in STAGES if (ROOT / "companion" / s / "node.py").exists()]
+    assert len(nodes) >= 7
+    for package in nodes:
         module = __import__(f"companion.{package}.node", fromlist=["node"])
         for _, kind in inspect.getmembers(module, inspect.isclass):
             if issubclass(kind, Node) and kind is not Node:
