@@ -1,0 +1,321 @@
+"""Laws of the voxel map: exact ray voxels, OctoMap's update, growth, storage."""
+
+import math
+
+import numpy as np
+import pytest
+from pyoctomap import OcTree
+
+from companion.core.errors import InputError
+from companion.mapping.sensor_model import SensorModel, quantise
+from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+
+STEPS = quantise(SensorModel())
+ORIGIN = np.array([0.31, -0.17, 1.53])
+
+
+def small(**changes):
+    return VoxelMap(VoxelMapConfig(**{"max_range_m": 8.0, "miss_clear_range_m": 5.0} | changes))
+
+
+def look(voxels, points_odom, *, origin=ORIGIN, misses=None, **more):
+    """One scan given by its end points in odom."""
+    points = (np.asarray(points_odom, np.float64) - origin).astype(np.float32).reshape(-1, 3)
+    return voxels.insert(
+        points, R_odom_body=np.eye(3), p_odom=origin, origin_odom=origin, miss_dirs_body=misses, **more
+    )
+
+
+def amanatides_woo(start, end, cell_m):
+    """The textbook's traversal: all voxels (tuples) from start to end."""
+    a, b = start / cell_m, end / cell_m
+    cell, last, d = np.floor(a).astype(int), np.floor(b).astype(int), b - a
+    step = np.where(d > 0, 1, -1)
+    with np.errstate(divide="ignore"):
+        t_next = np.where(d > 0, cell + 1 - a, a - cell) / np.abs(d)
+        t_step = 1 / np.abs(d)
+    seen = [tuple(int(c) for c in cell)]
+    for _ in range(int(np.abs(last - cell).sum())):
+        axis = int(np.argmin(t_next))
+        cell[axis] += step[axis]
+        t_next[axis] += t_step[axis]
+        seen.append(tuple(int(c) for c in cell))
+    assert seen[-1] == tuple(last)
+    return seen
+
+
+def random_rotation(rng):
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def expected_scan(points, misses, R, p, origin, config):
+    """(hit voxels, miss voxels) of one scan, by the reference traversal."""
+    hits, crossed = set(), set()
+    for v in points.astype(np.float64):
+        end = R @ v + p
+        length = np.linalg.norm(end - origin)
+        if length <= config.max_range_m:
+            voxels = amanatides_woo(origin, end, config.resolution_m)
+            hits.add(voxels[-1])
+        else:
+            end = origin + (end - origin) * config.max_range_m / length
+            voxels = amanatides_woo(origin, end, config.resolution_m)
+            voxels = voxels[:-1] or voxels
+        crossed.update(voxels)
+    for v in misses.astype(np.float64):
+        end = origin + R @ v * config.miss_clear_range_m / np.linalg.norm(v)
+        crossed.update(amanatides_woo(origin, end, config.resolution_m)[:-1])
+    return hits, crossed - hits
+
+
+def known_voxels(voxels):
+    """{voxel: steps} of every known voxel."""
+    arrays = voxels.to_arrays()
+    row, cell = np.nonzero(arrays["log_odds"] != -128)
+    xyz = 8 * arrays["block_xyz"][row] + np.stack([cell >> 6, cell >> 3 & 7, cell & 7], axis=1)
+    return dict(zip(map(tuple, xyz.tolist()), arrays["log_odds"][row, cell].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("resolution_m", [0.2, 0.13])
+@pytest.mark.parametrize("seed", range(3))
+def test_every_voxel_of_random_scans_is_that_of_amanatides_and_woo(seed, resolution_m):
+    rng = np.random.default_rng(seed)
+    voxels = small(resolution_m=resolution_m)
+    expected = {}
+    for _ in range(3):
+        R, p = random_rotation(rng), rng.uniform(-30, 30, 3)
+        origin = p + R @ rng.uniform(-0.2, 0.2, 3)
+        points = (rng.normal(size=(250, 3)) * rng.uniform(0.1, 6, (250, 1))).astype(np.float32)
+        misses = rng.normal(size=(60, 3)).astype(np.float32)
+        delta = voxels.insert(points, R_odom_body=R, p_odom=p, origin_odom=origin, miss_dirs_body=misses)
+        assert (delta.returns, delta.misses, delta.dropped) == (250, 60, 0)
+        hits, crossed = expected_scan(points, misses, R, p, origin, voxels.config)
+        for group, step in ((hits, STEPS.hit), (crossed, STEPS.miss)):
+            for voxel in sorted(group):
+                level = expected.get(voxel, 0) + step
+                expected[voxel] = min(max(level, STEPS.lowest), STEPS.highest)
+    assert known_voxels(voxels) == expected
+
+
+def room_scans(rng, count, returns):
+    """Returns on the walls of a box room with pillars, from a wandering sensor, in odom."""
+    pillars = rng.uniform(-5, 5, (6, 2))
+    for _ in range(count):
+        origin = rng.uniform(-1.5, 1.5, 3)
+        d = rng.normal(size=(returns, 3))
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        with np.errstate(divide="ignore"):
+            reach = np.min((np.sign(d) * [7.0, 6.0, 2.5] - origin) / d, axis=1)
+        for pillar in pillars:
+            offset, flat = pillar - origin[:2], d[:, :2]
+            a, b = np.sum(flat**2, axis=1), flat @ offset
+            inside = b**2 - a * (offset @ offset - 0.16)
+            t = np.where((inside > 0) & (b > 0), (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
+            reach = np.where(t > 0, np.minimum(reach, t), reach)
+        yield origin, origin + d * (reach + rng.normal(0, 0.01, returns))[:, None]
+
+
+def test_classes_agree_with_octomap():
+    """Same scans through pyoctomap: at least 99.9 % of all known voxels have the same class."""
+    voxels, tree = small(), OcTree(0.2)
+    for probability, setter in ((0.7, tree.setProbHit), (0.4, tree.setProbMiss)):
+        setter(probability)
+    tree.setClampingThresMin(0.12)
+    tree.setClampingThresMax(0.97)
+    for origin, ends in room_scans(np.random.default_rng(5), 12, 2500):
+        origin = origin.astype(np.float32).astype(np.float64)
+        look(voxels, ends, origin=origin)
+        tree.insertPointCloud(ends, origin, 8.0, False)
+    axes = [np.arange(-45, 45) * 0.2 + 0.1] * 3
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    theirs = np.asarray(tree.getLabels(centers)).ravel() + 1  # they count from -1, unknown
+    ours = voxels.classify(centers)
+    known = (ours > 0) | (theirs > 0)
+    assert known.sum() > 50_000
+    assert np.mean(ours[known] == theirs[known]) >= 0.999
+    assert np.mean(ours[theirs == 2] == 2) >= 0.99  # the occupied ones alone, too
+
+
+def test_one_hit_on_the_unknown_is_occupied_and_its_ray_is_free():
+    voxels = small()
+    end = ORIGIN + np.array([3.0, 0.4, 0.2])
+    look(voxels, end)
+    assert voxels.classify(np.array([end])) == [2]
+    assert voxels.classify(ORIGIN + np.linspace(0, 0.9, 30)[:, None] * (end - ORIGIN)).tolist() == [1] * 30
+    assert voxels.classify(np.array([end + np.array([0.5, 0, 0])])) == [0]
+    assert voxels.query(np.array([end]))[0] == pytest.approx(STEPS.hit / STEPS.per_unit)
+    assert np.isnan(voxels.query(np.array([end + np.array([0.5, 0, 0])]))[0])
+
+
+def test_a_hit_wins_over_the_rays_of_the_same_scan():
+    voxels = small()
+    near = ORIGIN + np.array([2.0, 0.0, 0.0])
+    look(voxels, np.concatenate([[near], ORIGIN + np.array([4.0, 0.0, 0.0]) + np.zeros((50, 3))]))
+    assert voxels.query(near[None])[0] == pytest.approx(STEPS.hit / STEPS.per_unit)
+
+
+def test_log_odds_stay_within_the_clamps_and_few_misses_clear():
+    voxels = small()
+    wall, behind = ORIGIN + np.array([2.0, 0.0, 0.0]), ORIGIN + np.array([4.0, 0.0, 0.0])
+    for _ in range(30):
+        look(voxels, wall)
+    assert voxels.query(wall[None])[0] == pytest.approx(STEPS.highest / STEPS.per_unit)
+    needed = 0
+    while voxels.classify(wall[None])[0] == 2:
+        look(voxels, behind)
+        needed += 1
+    assert needed == math.floor(STEPS.highest / -STEPS.miss) + 1
+    for _ in range(30):
+        look(voxels, behind)
+    assert voxels.query(wall[None])[0] == pytest.approx(STEPS.lowest / STEPS.per_unit)
+
+
+def test_a_saturated_free_block_still_takes_a_hit():
+    voxels = small()
+    around = np.random.default_rng(0).normal(size=(30_000, 3))
+    sphere = ORIGIN + 4.5 * around / np.linalg.norm(around, axis=1, keepdims=True)
+    for _ in range(8):
+        look(voxels, sphere)
+    arrays = voxels.to_arrays()
+    saturated = np.flatnonzero((arrays["log_odds"] == STEPS.lowest).all(axis=1))
+    assert len(saturated) > 10
+    target = (8 * arrays["block_xyz"][saturated[0]] + 3.5) * 0.2
+    for _ in range(4):
+        look(voxels, target)
+    assert voxels.query(target[None])[0] == pytest.approx((STEPS.lowest + 4 * STEPS.hit) / STEPS.per_unit)
+    assert voxels.classify(target[None]) == [2]
+
+
+def test_rays_beyond_the_range_clear_up_to_it_and_hit_nothing():
+    voxels = small()
+    look(voxels, ORIGIN + np.array([50.0, 0.0, 0.0]))
+    along = ORIGIN + np.array([[0.5, 0, 0], [7.5, 0, 0], [8.5, 0, 0], [50.0, 0, 0]])
+    assert voxels.classify(along).tolist() == [1, 1, 0, 0]
+    assert len(voxels.occupied_centers()) == 0
+
+
+def test_beams_without_return_clear_up_to_their_own_range():
+    voxels = small()
+    ghost = ORIGIN + np.array([0.0, 3.0, 0.0])
+    look(voxels, ghost)
+    assert voxels.classify(ghost[None]) == [2]
+    for _ in range(5):
+        look(voxels, np.empty((0, 3)), misses=np.array([[0.0, 2.0, 0.0]], np.float32))
+    assert voxels.classify(ORIGIN + np.array([[0, 3.0, 0], [0, 4.5, 0], [0, 5.5, 0]])).tolist() == [1, 1, 0]
+
+
+def test_axis_parallel_rays_from_a_voxel_corner_are_straight_lines():
+    voxels, start = small(), np.array([2, 1, 0])
+    origin = 0.2 * start
+    look(voxels, origin + 3.1 * np.concatenate([np.eye(3), -np.eye(3)]), origin=origin)
+    lines = {tuple(start + k * axis) for axis in np.eye(3, dtype=int) for k in range(-16, 16)}
+    assert set(known_voxels(voxels)) == {tuple(int(c) for c in cell) for cell in lines}
+    assert len(voxels.occupied_centers()) == 6
+
+
+def test_what_is_not_finite_or_on_the_own_body_is_dropped():
+    clean, dirty = small(), small()
+    ends = ORIGIN + np.random.default_rng(1).normal(size=(100, 3)) * 3 + 0.5
+    bad = np.array([[np.nan, 1, 1], [np.inf, 0, 0], [0, -np.inf, np.nan], [1e30, 0, 0], *ORIGIN[None]])
+    misses = np.array([[1, 0, 0], [np.nan, 0, 0], [0, 0, 0]], np.float32)
+    look(clean, ends, misses=misses[:1])
+    delta = look(dirty, np.concatenate([bad, ends]), misses=misses)
+    assert (delta.returns, delta.misses, delta.dropped) == (100, 1, 7)
+    assert known_voxels(clean) == known_voxels(dirty)
+    near = ORIGIN + np.array([[0.2, 0.0, 0.0], [1.2, 0.0, 0.0]])
+    assert look(small(), near, own_radius_m=0.4).returns == 1
+
+
+def test_free_points_make_free_unless_hit():
+    voxels = small()
+    here, struck = ORIGIN + np.array([0.0, 0.0, -1.0]), ORIGIN + np.array([1.0, 0.0, 0.0])
+    far_outside = ORIGIN + np.array([500.0, 0.0, 0.0])
+    look(voxels, struck, free_odom=np.array([here, struck, far_outside]))
+    assert voxels.classify(np.array([here, struck, far_outside])).tolist() == [1, 2, 0]
+
+
+def test_a_growing_map_keeps_what_it_has():
+    """Far apart scans until the hash and the store have grown; nothing is lost or moved."""
+    voxels = small()
+    rng = np.random.default_rng(2)
+    places = np.array([(60.0 * i - 500, 40.0 * j - 300, 5.0) for i in range(12) for j in range(10)])
+    cloud = rng.normal(size=(150, 3))
+    cloud *= rng.uniform(4, 7, (150, 1)) / np.linalg.norm(cloud, axis=1, keepdims=True)
+    first = look(voxels, places[0] + cloud, origin=places[0])
+    probe = places[0] + rng.uniform(-7, 7, (2000, 3))
+    before = voxels.query(probe)
+    for place in places[1:]:
+        delta = look(voxels, place + cloud, origin=place)
+        assert delta.returns == first.returns
+    assert voxels.block_count > 10_000
+    assert np.array_equal(voxels.query(probe), before, equal_nan=True)
+    assert np.all(voxels.classify((places[:, None] + cloud).reshape(-1, 3)) == 2)
+    assert len(np.unique(voxels.to_arrays()["block_xyz"], axis=0)) == voxels.block_count
+    assert 512 * voxels.block_count < voxels.memory_bytes < 700 * voxels.block_count + 4e6
+
+
+def test_delta_names_the_blocks_that_changed():
+    voxels = small()
+    end = ORIGIN + np.array([3.0, 0.0, 0.0])
+    first = look(voxels, end)
+    assert first.blocks_met == len(first.changed_blocks) == voxels.block_count
+    assert set(map(tuple, first.changed_blocks.tolist())) == {(0, -1, 0), (1, -1, 0), (2, -1, 0)}
+    assert len(look(voxels, end).changed_blocks) == 0
+
+
+def test_occupied_centers_are_where_the_hits_were():
+    voxels = small()
+    ends = ORIGIN + np.random.default_rng(4).normal(size=(200, 3)) * 2
+    look(voxels, ends)
+    hit = {tuple(c) for c in np.floor(ends / 0.2).astype(int).tolist()}
+    assert {tuple(c) for c in np.floor(voxels.occupied_centers() / 0.2).astype(int).tolist()} == hit
+    assert np.all(voxels.classify(voxels.occupied_centers()) == 2)
+
+
+def test_storage_round_trip_is_exact_and_goes_on_alike(tmp_path):
+    scans = list(room_scans(np.random.default_rng(9), 6, 500))
+    voxels = small()
+    for origin, ends in scans[:3]:
+        look(voxels, ends, origin=origin)
+    np.savez(tmp_path / "map.npz", **voxels.to_arrays())
+    with np.load(tmp_path / "map.npz") as stored:
+        again = VoxelMap.from_arrays(stored, voxels.config)
+    for origin, ends in scans[3:]:
+        look(voxels, ends, origin=origin)
+        look(again, ends, origin=origin)
+    for name, array in voxels.to_arrays().items():
+        assert np.array_equal(array, again.to_arrays()[name]), name
+
+
+def test_stored_maps_that_do_not_fit_are_refused():
+    arrays = small().to_arrays()
+    with pytest.raises(InputError, match="resolution_m"):
+        VoxelMap.from_arrays(arrays, VoxelMapConfig(resolution_m=0.1))
+    with pytest.raises(InputError, match="missing"):
+        VoxelMap.from_arrays({"resolution_m": np.array(0.2)}, VoxelMapConfig())
+    with pytest.raises(InputError, match="no map"):
+        VoxelMap.from_arrays(arrays | {"log_odds": np.zeros((3, 512), np.int8)}, VoxelMapConfig())
+
+
+def test_bad_poses_shapes_and_configs_are_refused():
+    voxels = small()
+    for origin in (np.array([np.nan, 0, 0]), np.array([1e9, 0, 0])):
+        with pytest.raises(InputError, match="origin_odom"):
+            voxels.insert(np.zeros((1, 3), np.float32), R_odom_body=np.eye(3), p_odom=np.zeros(3), origin_odom=origin)
+    with pytest.raises(InputError, match=r"\(N, 3\)"):
+        look_shape = np.zeros((4, 2), np.float32)
+        voxels.insert(look_shape, R_odom_body=np.eye(3), p_odom=np.zeros(3), origin_odom=np.zeros(3))
+    with pytest.raises(InputError, match="miss_clear_range_m"):
+        VoxelMapConfig(max_range_m=5.0, miss_clear_range_m=6.0)
+    assert voxels.block_count == 0
+
+
+def test_the_same_scans_give_the_same_bytes():
+    def fly():
+        voxels = small()
+        for origin, ends in room_scans(np.random.default_rng(3), 3, 400):
+            look(voxels, ends, origin=origin)
+        return b"".join(a.tobytes() for a in voxels.to_arrays().values())
+
+    assert fly() == fly()
