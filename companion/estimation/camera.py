@@ -61,9 +61,7 @@ class CameraTracker:
         self._anchors = np.empty((0, 3))
         self._ground_m = 0.0  # usual height of the anchors, a first guess of depth
 
-    def update(
-        self, pixels: Bytes2D, filter_: Filter, target: PointMap, planes: PlaneConfig
-    ) -> Normal | None:
+    def update(self, pixels: Bytes2D, filter_: Filter, target: PointMap, planes: PlaneConfig) -> Normal | None:
         """Correct the filter with an image of its own time; None if too few tracks came along."""
         normal = None
         if self._last is not None and len(self._pixels) >= self.config.min_tracks:
@@ -127,9 +125,7 @@ class CameraTracker:
         self._pixels = np.concatenate([self._pixels, found[good]])
         self._anchors = np.concatenate([self._anchors, anchors[good]])
 
-    def _anchor(
-        self, corners: Array32, filter_: Filter, target: PointMap, planes: PlaneConfig
-    ) -> tuple[Array, Flags]:
+    def _anchor(self, corners: Array32, filter_: Filter, target: PointMap, planes: PlaneConfig) -> tuple[Array, Flags]:
         """Where the corners' rays meet the map: fixed point of intersecting with the local plane."""
         R, p = filter_.state.R, filter_.state.p
         f, cx, cy = self._intrinsics

@@ -58,9 +58,7 @@ class Smoothed:
 class Smoother:
     """One node per likelihood; drops what is older than the lag."""
 
-    def __init__(
-        self, start: StartNode, noise: ImuNoise, config: GraphConfig, *, gravity_m_s2: float
-    ) -> None:
+    def __init__(self, start: StartNode, noise: ImuNoise, config: GraphConfig, *, gravity_m_s2: float) -> None:
         self.config = config
         self._params = _imu_params(noise, gravity_m_s2)
         isam = gtsam.ISAM2Params()
@@ -71,9 +69,7 @@ class Smoother:
         self._bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
         self._state = gtsam.NavState(gtsam.Rot3(start.R), start.p, start.v)
         self._node = 0
-        self._update(
-            _start_priors(self._state, self._bias, start.down, config), self._values(start.down), 0.0
-        )
+        self._update(_start_priors(self._state, self._bias, start.down, config), self._values(start.down), 0.0)
 
     def add(self, imu: Array, likelihood: PoseLikelihood, *, t_s: float) -> None:
         """Append a node at `t_s` (seconds since the start) from what was seen there.

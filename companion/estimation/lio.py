@@ -54,9 +54,7 @@ class ScanResult:
 class Lio:
     """Filter, map, and the log of nodes that deskewing needs."""
 
-    def __init__(
-        self, start: Filter, config: LioConfig, rig: Rig, camera: CameraConfig | None = None
-    ) -> None:
+    def __init__(self, start: Filter, config: LioConfig, rig: Rig, camera: CameraConfig | None = None) -> None:
         self.filter, self.config = start, config
         self.map = PointMap(config.map)
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
@@ -116,9 +114,7 @@ class Lio:
         before = self._pose()
         few = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
         scan = PlaneRegistration(self.map, few, self.config.plane)
-        normal = self.filter.update(
-            scan.linearise, iterations=self.config.iterations, at_least=self.config.min_planes
-        )
+        normal = self.filter.update(scan.linearise, iterations=self.config.iterations, at_least=self.config.min_planes)
         move_nodes(self._nodes, before, self._pose())
         return normal
 

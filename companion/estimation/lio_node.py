@@ -125,9 +125,7 @@ class LioNode(Node):
             yield LIO_STATE(self._state(lio, "camera", normal))
             yield LIKELIHOOD(self._likelihood("camera", normal))
 
-    def _state(
-        self, lio: Lio, source: Literal["start", "lidar", "camera"], normal: Normal | None
-    ) -> LioState:
+    def _state(self, lio: Lio, source: Literal["start", "lidar", "camera"], normal: Normal | None) -> LioState:
         state = lio.filter.state
         return LioState(
             stamp_ns=self._time_ns,
@@ -172,9 +170,7 @@ class LioNode(Node):
         elif result.normal is not None and result.normal.used < self._config.lio.min_planes:
             trouble = "hardly a point fits the map"
         if trouble != self._trouble:
-            yield self._why(
-                "leave scans out" if trouble else "use scans again", trouble or "they fit the map"
-            )
+            yield self._why("leave scans out" if trouble else "use scans again", trouble or "they fit the map")
         self._trouble = trouble
 
     def _why(self, what: str, because: str) -> Output:

@@ -1,0 +1,1 @@
+"""Watches what the sensors deliver: order of stamps, gaps, silence, numbers that are none."""

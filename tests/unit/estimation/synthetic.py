@@ -49,7 +49,7 @@ def flight(seconds=12.0, speed=3.0):
     p[:, :2] -= p[0, :2]
     v = np.gradient(p, 0.001, axis=0)
     a = np.gradient(v, 0.001, axis=0)
-    up = a + [0, 0, G]
+    up = a + np.array([0, 0, G])
     yaw = 0.4 * np.sin(0.7 * (t - REST_S)) * h
     heading = np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
     z = up / np.linalg.norm(up, axis=1, keepdims=True)
@@ -93,9 +93,7 @@ def lidar_scan(f, end_s, rig, world, rng, *, beams=16, azimuths=512, noise_m=0.0
     elevation = np.tile(np.radians(np.linspace(-25, 20, beams)), azimuths)
     age = 0.1 * (1 - azimuth)
     angle = 2 * np.pi * azimuth
-    dirs = np.column_stack(
-        [np.cos(elevation) * np.cos(angle), np.cos(elevation) * np.sin(angle), np.sin(elevation)]
-    )
+    dirs = np.column_stack([np.cos(elevation) * np.cos(angle), np.cos(elevation) * np.sin(angle), np.sin(elevation)])
     R, p = f.pose(end_s - age)
     origin = p + R.apply(rig.lidar.p_body)
     rays = (R * Rotation.from_matrix(rig.lidar.R_body_sensor)).apply(dirs)
