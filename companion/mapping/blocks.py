@@ -12,7 +12,6 @@ from companion.mapping.sensor_model import UNKNOWN, Steps
 i16, i64, u8, u64 = np.int16, np.int64, np.uint8, np.uint64
 _GROWTH = 4096  # blocks: 2 MB at a time, so that growing never stalls a scan
 _EMPTY = -1
-_EXPAND = np.array([sum(1 << (8 * b) for b in range(8) if v >> b & 1) for v in range(256)], np.uint64)
 
 
 class BlockStore:
@@ -26,14 +25,14 @@ class BlockStore:
         self.count = 0
         self.xyz = np.zeros((_GROWTH, 3), np.int32)
         self.log_odds = np.zeros((_GROWTH, CELLS), np.int8)
-        self.all_free = np.zeros(_GROWTH, np.uint8)  # 1: every cell is at the lower clamp
+        self._settled = np.zeros((_GROWTH, WORDS), np.uint64)  # bits: the cell is at the lower clamp
         self._keys = np.full(4 * _GROWTH, _EMPTY, np.int64)
         self._rows = np.zeros(4 * _GROWTH, np.int32)
 
     @property
     def memory_bytes(self) -> int:
         """Bytes held, spare capacity included."""
-        arrays = (self.xyz, self.log_odds, self.all_free, self._keys, self._rows)
+        arrays = (self.xyz, self.log_odds, self._settled, self._keys, self._rows)
         return sum(a.nbytes for a in arrays)
 
     def fold(self, grid: RayGrid, steps: Steps) -> tuple[int, NDArray[np.int32]]:
@@ -48,10 +47,11 @@ class BlockStore:
         table = (self._keys, self._rows, self.xyz)
         self.count = int(_rows_of(met, grid.side, grid.corner, table, self.count, rows))
         self.log_odds[before : self.count] = UNKNOWN
+        self._settled[before : self.count] = 0
         amounts = np.array([steps.hit, steps.miss, steps.lowest, steps.highest], np.int16)
         changed = np.zeros(len(met), np.uint8)
         words = (grid.free.reshape(-1, WORDS), grid.hit.reshape(-1, WORDS))
-        _fold(met, rows, words, (self.log_odds, self.all_free), (amounts, _EXPAND), changed)
+        _fold(met, rows, words, (self.log_odds, self._settled), amounts, changed)
         return len(met), self.xyz[rows[changed != 0]]
 
     def at(self, cells: NDArray[np.int64]) -> NDArray[np.int8]:
@@ -69,7 +69,8 @@ class BlockStore:
         self.__init__()  # type: ignore[misc]
         self._reserve(len(xyz))
         self.xyz[: len(xyz)], self.log_odds[: len(xyz)] = xyz, log_odds
-        self.all_free[: len(xyz)] = np.all(log_odds == lowest, axis=1)
+        settled = np.packbits(log_odds == lowest, axis=1, bitorder="little")
+        self._settled[: len(xyz)] = settled.view(np.uint64)
         self.count = len(xyz)
         _enter(self.xyz, self.count, self._keys, self._rows)
 
@@ -80,7 +81,7 @@ class BlockStore:
             capacity = -(-count // _GROWTH) * _GROWTH
             self.xyz.resize((capacity, 3), refcheck=False)  # realloc: large arrays move without a copy
             self.log_odds.resize((capacity, CELLS), refcheck=False)
-            self.all_free.resize(capacity, refcheck=False)
+            self._settled.resize((capacity, WORDS), refcheck=False)
         if 2 * count > len(self._keys):
             size = 1 << (2 * count - 1).bit_length()
             self._keys, self._rows = np.full(size, _EMPTY, np.int64), np.zeros(size, np.int32)
@@ -115,50 +116,71 @@ def _enter(xyz, count, keys, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _fold(met, rows, words, blocks, tables, changed):  # type: ignore[no-untyped-def]
-    """One miss for each free bit without a hit bit, one hit for each hit bit; clears both."""
+def _fold(met, rows, words, blocks, amounts, changed):  # type: ignore[no-untyped-def]
+    """One miss for each free bit without a hit bit, one hit for each hit bit; clears both.
+
+    A miss cannot change a settled cell, so most blocks of a place seen before are skipped.
+    """
     free, hit = words
-    log_odds, all_free = blocks
-    amounts, expand = tables
-    mask64 = np.empty(CELLS // 8, np.uint64)
-    mask = mask64.view(np.uint8)
+    log_odds, settled = blocks
+    octets = np.empty((2, CELLS // 8), np.uint64)  # of cells that get a miss, a hit
     for m in range(met.size):
         f, h, row = free[met[m]], hit[met[m]], rows[m]
-        any_hit = u64(0)
+        done = settled[row]
+        any_bit = u64(0)
         for w in range(WORDS):
-            any_hit |= h[w]
-        if all_free[row] != 0 and any_hit == 0:  # nothing can change
-            f[:] = u64(0)
-            continue
-        for w in range(WORDS):
-            bits = f[w] & ~h[w]
-            f[w] = u64(0)
-            for b in range(8):
-                mask64[8 * w + b] = expand[(bits >> u64(8 * b)) & u64(255)]
-        changed[m], all_free[row] = _miss(log_odds[row], mask, amounts)
-        if any_hit != 0:
-            all_free[row] = u8(0)
-            changed[m] |= _hit(log_odds[row], h, amounts)
+            f[w] &= ~(h[w] | done[w])
+            any_bit |= f[w] | h[w]
+        if any_bit != u64(0):
+            _spread(f, octets[0])
+            _spread(h, octets[1])
+            cells = log_odds[row]
+            changed[m] = _update(cells, octets[0].view(np.uint8), octets[1].view(np.uint8), amounts)
+            _settle(cells.view(np.uint64), u8(amounts[2]), done)
+        f[:] = u64(0)
+        h[:] = u64(0)
 
 
 @njit(cache=True, nogil=True)
-def _miss(cells, mask, amounts):  # type: ignore[no-untyped-def]
-    """Branch-free over the block; returns (a class changed, all cells at the lower clamp)."""
-    step, lowest = amounts[1], amounts[2]
-    unknown = np.int8(UNKNOWN)
-    differ, spread = np.int8(0), np.int8(0)
+def _spread(words, octets):  # type: ignore[no-untyped-def]
+    """Bit i of the words makes byte i of the octets not zero."""
+    for w in range(WORDS):
+        for b in range(8):
+            byte = (words[w] >> u64(8 * b)) & u64(255)
+            octets[8 * w + b] = (byte * u64(0x0101010101010101)) & u64(0x8040201008040201)
+
+
+@njit(cache=True, nogil=True)
+def _update(cells, missed, hit, amounts):  # type: ignore[no-untyped-def]
+    """Branch-free over the block; returns whether a cell changed its class."""
+    unknown, zero = np.int8(UNKNOWN), np.int8(0)
+    hit_step, miss_step, lowest, highest = amounts[0], amounts[1], amounts[2], amounts[3]
+    differ = zero
     for c in range(CELLS):
         old = cells[c]
-        base = i16(0) if old == unknown else i16(old)
-        less = i16(base + step)
-        less = lowest if less < lowest else less
-        new = np.int8(less) if mask[c] != u8(0) else old
+        level = i16(0) if old == unknown else i16(old)
+        level = i16(level + (hit_step if hit[c] != u8(0) else miss_step))
+        level = lowest if level < lowest else level
+        level = highest if level > highest else level
+        new = np.int8(level) if (missed[c] | hit[c]) != u8(0) else old
         cells[c] = new
-        flip = np.int8(old ^ new)  # its sign bit: occupied <-> free or unknown
-        differ = np.int8(differ | flip)
-        differ = np.int8(differ | (unknown if (old == unknown and new != unknown) else np.int8(0)))
-        spread = np.int8(spread | np.int8(new ^ np.int8(lowest)))
-    return u8(differ < 0), u8(spread == 0)
+        differ = np.int8(differ | np.int8(old ^ new))  # its sign bit: occupied <-> free or unknown
+        differ = np.int8(differ | (unknown if (old == unknown and new != unknown) else zero))
+    return u8(differ < zero)
+
+
+@njit(cache=True, nogil=True)
+def _settle(octets, lowest, done):  # type: ignore[no-untyped-def]
+    """Set the bits of the cells that equal `lowest`; eight cells are one octet."""
+    low, top, gather = u64(0x7F7F7F7F7F7F7F7F), u64(0x0101010101010101), u64(0x0102040810204080)
+    pattern = u64(lowest) * top
+    for w in range(WORDS):
+        word = u64(0)
+        for b in range(8):
+            x = octets[8 * w + b] ^ pattern
+            zero_bytes = (~(((x & low) + low) | x | low)) >> u64(7)  # 1 in each byte that is zero
+            word |= ((zero_bytes * gather) >> u64(56)) << u64(8 * b)
+        done[w] = word
 
 
 @njit(cache=True, nogil=True)
@@ -208,9 +230,7 @@ def _window(corner, table, log_odds, lines):  # type: ignore[no-untyped-def]
                         state = u8(2) if cells[c] >= zero else u8(1)
                         block[c] = u8(0) if cells[c] == unknown else state
                 for line in range(BLOCK * BLOCK):
-                    lines[BLOCK * i + (line >> 3), BLOCK * j + (line & 7), k] = (
-                        words[line] if known else u64(0)
-                    )
+                    lines[BLOCK * i + (line >> 3), BLOCK * j + (line & 7), k] = words[line] if known else u64(0)
 
 
 @njit(cache=True, nogil=True)

@@ -81,9 +81,7 @@ class MappingNode(Node):
         if self.scans > 0:
             return cells_around(p_odom, radius_m=self.config.hull_radius_m, height_m=0.0, cell_m=cell_m)
         radius_m = max(self.config.hull_radius_m, self.config.start_free_radius_m)
-        return cells_around(
-            p_odom, radius_m=radius_m, height_m=self.config.start_free_height_m, cell_m=cell_m
-        )
+        return cells_around(p_odom, radius_m=radius_m, height_m=self.config.start_free_height_m, cell_m=cell_m)
 
     def _compile(self) -> None:
         """Run every kernel once on nothing, so that the first scan does not wait for compilers."""

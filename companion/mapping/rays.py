@@ -216,8 +216,6 @@ def _met(free, side, low, high, found):  # type: ignore[no-untyped-def]
             for number in range((i * side + j) * side + low[2], (i * side + j) * side + high[2] + 1):
                 words = free[u64(number)]
                 found[count] = number
-                any_bit = (
-                    words[0] | words[1] | words[2] | words[3] | words[4] | words[5] | words[6] | words[7]
-                )
+                any_bit = words[0] | words[1] | words[2] | words[3] | words[4] | words[5] | words[6] | words[7]
                 count += any_bit != u64(0)
     return count

@@ -57,9 +57,7 @@ def quantise(model: SensorModel) -> Steps:
     )
     _, h, m = min(candidates, default=(0.0, 0, 0))
     if h == 0:
-        raise InputError(
-            "one hit or miss is too weak beside the clamps for int8 steps", field="mapping.voxels.sensor"
-        )
+        raise InputError("one hit or miss is too weak beside the clamps for int8 steps", field="mapping.voxels.sensor")
     per_unit = h / hit
     lowest, highest = log_odds(model.lowest) * per_unit, log_odds(model.highest) * per_unit
     return Steps(h, -m, round(lowest), round(highest), per_unit)

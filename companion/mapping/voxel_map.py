@@ -157,9 +157,7 @@ class VoxelMap:
         _check_same(arrays, "sensor_model", np.array([model.hit, model.miss, model.lowest, model.highest]))
         xyz, log_odds = (np.asarray(_entry(arrays, name)) for name in ("block_xyz", "log_odds"))
         if xyz.shape != (len(xyz), 3) or log_odds.shape != (len(xyz), CELLS) or log_odds.dtype != np.int8:
-            raise InputError(
-                f"shapes {xyz.shape}, {log_odds.shape} {log_odds.dtype} are no map", field="log_odds"
-            )
+            raise InputError(f"shapes {xyz.shape}, {log_odds.shape} {log_odds.dtype} are no map", field="log_odds")
         if len(np.unique(xyz, axis=0)) != len(xyz):
             raise InputError("a block is there twice", field="block_xyz")
         voxels = cls(config)
@@ -184,9 +182,7 @@ def _rows(vectors: Array32) -> Array32:
 def _check_pose(**parts: Array) -> None:
     for name, part in parts.items():
         if not np.all(np.abs(part) < _FARTHEST_M):
-            raise InputError(
-                f"{part.tolist()} is no pose", field=name, valid=f"finite, within {_FARTHEST_M:g} m"
-            )
+            raise InputError(f"{part.tolist()} is no pose", field=name, valid=f"finite, within {_FARTHEST_M:g} m")
 
 
 def _entry(arrays: Mapping[str, Any], name: str) -> Any:
