@@ -52,8 +52,8 @@ class Autopilot:
         self.commander = Commander(self.parameters, self.estimator, self.controller, say=self._say)
         self._missions = MissionStore(self._encoder)
         self._telemetry = Telemetry(
-            self._clock, self._encoder, self.estimator, self.controller, self.commander,
-            readings=self._readings, missions=self._missions,
+            self._clock, self._encoder, self.estimator, self.controller,
+            commander=self.commander, readings=self._readings, missions=self._missions,
         )  # fmt: skip
         self._telemetry.origin = (
             config.origin_latitude_deg, config.origin_longitude_deg, config.origin_altitude_m,
@@ -64,8 +64,9 @@ class Autopilot:
         self.timesync = TimeSync()
         self._services = ParameterService(self.parameters, self._encoder)
         self._inbox = Inbox(
-            config.system_id, self.commander, self.estimator, self._commands, self._encoder,
-            timesync=self.timesync, parameters=self._services, missions=self._missions, say=self._say,
+            config.system_id, self.commander, self.estimator, self._commands,
+            encoder=self._encoder, timesync=self.timesync, parameters=self._services, missions=self._missions,
+            say=self._say,
         )  # fmt: skip
         self._texts: list[tuple[Severity, str]] = []
         self._text_id = self._steps = 0
@@ -159,6 +160,5 @@ class Autopilot:
         self._text_id = self._text_id % 65535 + 1
         pieces = [raw[i : i + TEXT_BYTES] for i in range(0, len(raw), TEXT_BYTES)]
         return b"".join(
-            self._encoder(BY_NAME["STATUSTEXT"], severity, piece, self._text_id, k)
-            for k, piece in enumerate(pieces)
+            self._encoder(BY_NAME["STATUSTEXT"], severity, piece, self._text_id, k) for k, piece in enumerate(pieces)
         )

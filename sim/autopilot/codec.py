@@ -42,9 +42,7 @@ def _layout(cls: Any) -> Layout:
     chars = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
     flat = [1 if chars[f] == "char" else n for f, n in zip(cls.ordered_fieldnames, lengths, strict=True)]
     name: str = cls.msgname
-    return Layout(
-        name, cls.id, bytes([cls.crc_extra]), cls.unpacker, tuple(cls.ordered_fieldnames), tuple(flat)
-    )
+    return Layout(name, cls.id, bytes([cls.crc_extra]), cls.unpacker, tuple(cls.ordered_fieldnames), tuple(flat))
 
 
 LAYOUTS: Final[dict[int, Layout]] = {i: _layout(cls) for i, cls in dialect.mavlink_map.items()}
@@ -66,9 +64,7 @@ class Encoder:
         sequence, msg_id = self._sequence, layout.msg_id
         self._sequence = (sequence + 1) & 0xFF
         body = (
-            _HEAD.pack(
-                len(payload), 0, 0, sequence, self._system, self._component, msg_id & 0xFFFF, msg_id >> 16
-            )
+            _HEAD.pack(len(payload), 0, 0, sequence, self._system, self._component, msg_id & 0xFFFF, msg_id >> 16)
             + payload
         )
         return b"\xfd" + body + mcrf4xx(body + layout.seed).to_bytes(2, "little")

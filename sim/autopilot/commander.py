@@ -31,9 +31,7 @@ Say = Callable[[Severity, str], None]
 class Commander:
     """The vehicle's state: armed or not, mode, failsafe. One step per 10 ms by `tick`."""
 
-    def __init__(
-        self, parameters: Parameters, estimator: Estimator, controller: Controller, *, say: Say
-    ) -> None:
+    def __init__(self, parameters: Parameters, estimator: Estimator, controller: Controller, *, say: Say) -> None:
         self._parameters, self._estimator, self._controller, self._say = (
             parameters,
             estimator,
@@ -249,12 +247,7 @@ class Commander:
             return
         self._battery_warned = level
         self._say(Severity.CRITICAL, "Critical battery" if level == 2 else "Low battery level")
-        if (
-            level == 2
-            and p.integer("COM_LOW_BAT_ACT") >= 2
-            and not self.flight.landed
-            and not self.mode.lands
-        ):
+        if level == 2 and p.integer("COM_LOW_BAT_ACT") >= 2 and not self.flight.landed and not self.mode.lands:
             act = Mode.RETURN if p.integer("COM_LOW_BAT_ACT") == 3 else Mode.LAND
             self._fail(act, "battery critical")
 

@@ -59,9 +59,7 @@ class Commands:
             611: self._set_origin,
         }
 
-    def run(
-        self, now_ns: int, number: int, params: tuple[Any, ...], *, integer: bool, frame: int = 0
-    ) -> Result:
+    def run(self, now_ns: int, number: int, params: tuple[Any, ...], *, integer: bool, frame: int = 0) -> Result:
         """Result of MAV_CMD `number`; unknown ones are UNSUPPORTED."""
         action = self._actions.get(number)
         if action is None:
@@ -91,11 +89,7 @@ class Commands:
     def _turn(self, c: Command) -> Result:
         """CONDITION_YAW: heading in degrees, absolute, or relative with the direction of param 3."""
         degrees, _, direction, relative = c.params[:4]
-        if (
-            not math.isfinite(degrees)
-            or self._commander.mode is not Mode.HOLD
-            or self._commander.flight.landed
-        ):
+        if not math.isfinite(degrees) or self._commander.mode is not Mode.HOLD or self._commander.flight.landed:
             return Result.TEMPORARILY_REJECTED
         yaw = math.radians(degrees)
         if relative == 1.0:
@@ -181,8 +175,8 @@ class Commands:
     def _version(self) -> bytes:
         none = (0,) * 8
         return self._encoder(
-            BY_NAME["AUTOPILOT_VERSION"], CAPABILITIES, self._uid, VERSION, VERSION, 0, 1, 0, 0, *none, *none, *none,
-            *((0,) * 18),
+            BY_NAME["AUTOPILOT_VERSION"], CAPABILITIES, self._uid, VERSION, VERSION, 0, 1, 0, 0,
+            *none, *none, *none, *((0,) * 18),
         )  # fmt: skip
 
     def _send_modes(self) -> None:

@@ -63,7 +63,8 @@ class Controller:
         """
         self._refresh(self._dt)
         cascade.position_step(
-            setpoint, state, acceleration, limits, dt, self._gains, self.velocity_integral, self.attitude_setpoint, self._out
+            setpoint, state, acceleration, limits, dt, self._gains,
+            self.velocity_integral, self.attitude_setpoint, self._out,
         )  # fmt: skip
 
     def idle(self, command: float) -> Array:
@@ -98,7 +99,8 @@ class Controller:
         attitude = [p[f"MC_{a}_P"] for a in axes]
         smooth = [_low_pass(p["IMU_GYRO_CUTOFF"], dt), _low_pass(p["IMU_DGYRO_CUTOFF"], dt)]
         self._rate_gains[:] = [
-            *attitude, p["MC_YAW_WEIGHT"], *rate[0], *rate[1], *rate[2], *limit, *top, *smooth, dt, p["THR_MDL_FAC"],
+            *attitude, p["MC_YAW_WEIGHT"], *rate[0], *rate[1], *rate[2], *limit, *top, *smooth, dt,
+            p["THR_MDL_FAC"],
         ]  # fmt: skip
         self._version, self._dt = p.version, dt
 

@@ -84,6 +84,7 @@ def _turn_world(q, r):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def rotation_of(q):  # type: ignore[no-untyped-def]
+    """R_ned_frd of a quaternion wxyz."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     R = np.empty((3, 3))
     R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
@@ -183,6 +184,7 @@ def _correct_ring(ring, total):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def yaw_of(q):  # type: ignore[no-untyped-def]
+    """Heading from north, clockwise, rad."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
@@ -198,7 +200,10 @@ def _yaw_row(q, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def fuse_pose(x, P, ring, past, z, variance, gates, ratios):  # type: ignore[no-untyped-def]
-    """Fuse an external pose z (7,): p_ned, v_ned, yaw; NaN rows are absent. `past` is the state at its stamp."""
+    """Fuse an external pose z (7,): p_ned, v_ned, yaw; NaN rows are absent.
+
+    `past` is the state at its stamp; `ratios` receives each row's innovation test.
+    """
     total, h = np.zeros(15), np.zeros(15)
     for row in range(ROWS):
         ratios[row] = math.nan

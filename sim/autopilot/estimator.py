@@ -7,7 +7,7 @@ stamps here are autopilot time; all arrays are NED/FRD except the IMU's, which a
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from companion.core.messages import Array
 from sim.autopilot import ekf
 from sim.autopilot.frames import quaternion_from_euler
 from sim.autopilot.params import Parameters
-from sim.autopilot.readings import GpsFix
+from sim.autopilot.readings import ExternalPose, GpsFix
 
 ALIGN_SAMPLES: Final = 200  # at rest before roll, pitch and gyro bias are set
 HPOS, VPOS, VELOCITY, YAW = 1, 2, 4, 8  # bits of EKF2_EV_CTRL; EKF2_GPS_CTRL has the first three
@@ -23,20 +23,6 @@ VISION_HEIGHT: Final = 3  # EKF2_HGT_REF
 BARO_BIAS_GAIN: Final = 0.01  # per reading
 NS: Final = 1_000_000_000
 NEVER: Final = -(1 << 62)
-
-
-class ExternalPose(NamedTuple):
-    """What the companion's ODOMETRY says; NaN where it says nothing."""
-
-    stamp_ns: int
-    p: Array  # m, (3,)
-    v: Array  # m/s, (3,)
-    v_in_body: bool
-    yaw: float
-    variance: Array  # p (3), v (3), yaw: (7,)
-    aligned_with_north: bool  # frame LOCAL_NED instead of LOCAL_FRD
-    reset_counter: int
-    quality: int
 
 
 class Estimator:
@@ -164,7 +150,10 @@ class Estimator:
         self.attitude_valid = True
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Fuse an ODOMETRY as EKF2_EV_CTRL allows; reset to it at its first, at a new counter, after rejection."""
+        """Fuse an ODOMETRY as EKF2_EV_CTRL allows.
+
+        The state is reset to the first one, at a new reset counter, and after long rejection.
+        """
         control = self._parameters.integer("EKF2_EV_CTRL")
         if not self.attitude_valid or pose.quality < self._parameters["EKF2_EV_QMIN"]:
             return
@@ -182,10 +171,7 @@ class Estimator:
         if self.yaw_aligned:
             self._vision_ns = stamp
             for row in range(6):
-                if (
-                    counter_changed
-                    or self.now_ns - self._aided_ns[row] > self._parameters["EKF2_NOAID_TOUT"] * 1e3
-                ):
+                if counter_changed or self.now_ns - self._aided_ns[row] > self._parameters["EKF2_NOAID_TOUT"] * 1e3:
                     self._reset(row, variance)
             self._fuse(stamp, variance, self._vision_gates())
 
@@ -205,12 +191,13 @@ class Estimator:
         z[6] = yaw if control & YAW else np.nan
 
     def _variance(self, pose: ExternalPose) -> Array:
-        """The message's variances, not below the parameters'; the parameters' alone if EKF2_EV_NOISE_MD is 1."""
+        """The message's variances, not below the parameters'; these alone if EKF2_EV_NOISE_MD is 1."""
         p = self._parameters
         floor = np.array([p["EKF2_EVP_NOISE"]] * 3 + [p["EKF2_EVV_NOISE"]] * 3 + [p["EKF2_EVA_NOISE"]]) ** 2
         if p.integer("EKF2_EV_NOISE_MD") == 1:
             return floor
-        return np.fmax(pose.variance, floor)
+        larger: Array = np.fmax(pose.variance, floor)
+        return larger
 
     def _vision_gates(self) -> Array:
         p = self._parameters
@@ -239,9 +226,7 @@ class Estimator:
 
     def baro(self, altitude_m: float) -> None:
         """Fuse the barometer if it is the height's reference or the only one left, else learn its bias."""
-        if not (
-            math.isfinite(altitude_m) and self._parameters.integer("EKF2_BARO_CTRL") and self.attitude_valid
-        ):
+        if not (math.isfinite(altitude_m) and self._has_baro() and self.attitude_valid):
             return
         self.baro_altitude = altitude_m
         if math.isnan(self._baro_bias):
@@ -253,8 +238,11 @@ class Estimator:
         sigma = self._parameters["EKF2_BARO_NOISE"]
         self._single(2, self._baro_bias - altitude_m, sigma * sigma, self._parameters["EKF2_BARO_GATE"])
 
+    def _has_baro(self) -> bool:
+        return bool(self._parameters.integer("SYS_HAS_BARO") and self._parameters.integer("EKF2_BARO_CTRL"))
+
     def gps(self, fix: GpsFix) -> None:
-        """Fuse a fix if EKF2_GPS_CTRL allows, the heading is known and no LOCAL_FRD vision holds the frame."""
+        """Fuse a fix if EKF2_GPS_CTRL allows, the heading is known and no vision holds the frame."""
         control = self._parameters.integer("EKF2_GPS_CTRL")
         vision = self.now_ns - self._vision_ns < NS
         if not self._parameters.integer("SYS_HAS_GPS") or fix.fix_type < 3 or not self.yaw_aligned or vision:
@@ -279,7 +267,7 @@ class Estimator:
         self._fuse(self.now_ns, variance, gates)
 
     def hold(self, *, at_rest: bool) -> None:
-        """At 100 Hz: while nothing aids the horizontal, gravity holds the tilt; at rest the place holds, too."""
+        """At 100 Hz: while nothing aids the horizontal, gravity holds the tilt; at rest, zero speed."""
         if not self.attitude_valid or (self.xy_valid and self._silent_ns(0, 1) < NS):
             return
         ekf.fuse_gravity(self.x, self.P, self._ring, self.force, 10.0 * self._parameters["EKF2_GRAV_NOISE"])

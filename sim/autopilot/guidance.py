@@ -25,14 +25,14 @@ class Guidance:
         self.target = np.zeros(3)
         self.setpoint = np.full(SIZE, np.nan)
         self._point, self._speed = np.zeros(3), np.zeros(3)
-        self._yaw = 0.0
+        self._yaw = self._yaw_target = 0.0
         self.cruise = math.nan  # m/s by MAV_CMD_DO_CHANGE_SPEED; NaN: MPC_XY_CRUISE
         self.landing = False  # the last leg of a return, too
 
     def start(self, mode: Mode, estimator: Estimator, yaw: float, *, climb_m: float = 0.0) -> None:
         """Enter a mode at the vehicle's place and speed; `climb_m` is the height of a take-off."""
         self._point[:], self._speed[:] = estimator.p, estimator.v
-        self._yaw = yaw
+        self._yaw = self._yaw_target = yaw
         self.landing = mode.lands
         braking = self._parameters["MPC_ACC_HOR"]
         speed = math.hypot(estimator.v[0], estimator.v[1])
@@ -49,7 +49,7 @@ class Guidance:
         keep = np.isnan(target)
         self.target[:] = np.where(keep, self.target, target)
         if math.isfinite(yaw):
-            self._yaw = yaw
+            self._yaw_target = yaw
 
     def returning(self, estimator: Estimator, home: Array) -> None:
         """Plan a return: climb first unless home is near, then fly over it, then land."""
@@ -65,6 +65,9 @@ class Guidance:
             self._return_leg(estimator, home)
         sp = self.setpoint
         sp[A] = np.nan
+        turn = math.radians(self._parameters["MPC_YAWRAUTO_MAX"]) * dt
+        left = math.remainder(self._yaw_target - self._yaw, 2 * math.pi)
+        self._yaw += min(max(left, -turn), turn)
         sp[YAW], sp[YAW_RATE] = self._yaw, np.nan
         if mode is Mode.DESCEND:
             sp[P] = sp[V] = np.nan

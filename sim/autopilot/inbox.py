@@ -10,11 +10,12 @@ import numpy as np
 from sim.autopilot.codec import BY_NAME, Encoder, Frame
 from sim.autopilot.commander import Commander, Say
 from sim.autopilot.commands import Commands
-from sim.autopilot.estimator import Estimator, ExternalPose
+from sim.autopilot.estimator import Estimator
 from sim.autopilot.frames import euler_from_quaternion
 from sim.autopilot.mission_store import MissionStore
 from sim.autopilot.modes import BY_NUMBERS, Severity
 from sim.autopilot.params import ParameterService
+from sim.autopilot.readings import ExternalPose
 from sim.autopilot.setpoint import Refused, read_setpoint
 from sim.autopilot.timesync import TimeSync
 
@@ -28,8 +29,8 @@ class Inbox:
     """Dispatches frames; answers wait in `take()`."""
 
     def __init__(
-        self, system_id: int, commander: Commander, estimator: Estimator, commands: Commands, encoder: Encoder,
-        *, timesync: TimeSync, parameters: ParameterService, missions: MissionStore, say: Say,
+        self, system_id: int, commander: Commander, estimator: Estimator, commands: Commands,
+        *, encoder: Encoder, timesync: TimeSync, parameters: ParameterService, missions: MissionStore, say: Say,
     ) -> None:  # fmt: skip
         self._system, self._commander, self._estimator = system_id, commander, estimator
         self._commands, self._encoder, self._timesync = commands, encoder, timesync
@@ -84,7 +85,7 @@ class Inbox:
             self._commander.accept_setpoint(now_ns, setpoint)
 
     def _odometry(self, now_ns: int, frame: Frame) -> None:
-        """PX4 takes LOCAL_NED or LOCAL_FRD poses with BODY_FRD (or local) velocities of a vision estimator."""
+        """PX4 takes LOCAL_NED or LOCAL_FRD poses with BODY_FRD or local velocities, of vision only."""
         v = frame.values
         frame_id, child, counter, kind, quality = v[56:61]
         if kind not in VISION_TYPES:
@@ -134,9 +135,7 @@ class Inbox:
             self._ack(number, result, frame)
 
     def _ack(self, number: int, result: int, frame: Frame) -> None:
-        self._out += self._encoder(
-            BY_NAME["COMMAND_ACK"], number, result, 0, 0, frame.system, frame.component
-        )
+        self._out += self._encoder(BY_NAME["COMMAND_ACK"], number, result, 0, 0, frame.system, frame.component)
 
     def _set_mode(self, now_ns: int, frame: Frame) -> None:
         custom, system, base = frame.values
@@ -170,9 +169,7 @@ class Inbox:
         answer = [0] * 251
         answer[0:6] = sequence & 0xFF, sequence >> 8, asked[2], NAK, 1, asked[3]
         answer[12] = UNKNOWN_COMMAND
-        self._out += self._encoder(
-            BY_NAME["FILE_TRANSFER_PROTOCOL"], network, frame.system, frame.component, *answer
-        )
+        self._out += self._encoder(BY_NAME["FILE_TRANSFER_PROTOCOL"], network, frame.system, frame.component, *answer)
 
     def _log_list(self, now_ns: int, frame: Frame) -> None:
         if self._for_us(frame):

@@ -26,7 +26,7 @@ class Mode(Enum):
     @property
     def automatic(self) -> bool:
         """Flown by the autopilot's own guidance."""
-        return self.value[0] == 4
+        return self not in (Mode.MANUAL, Mode.POSCTL, Mode.OFFBOARD)
 
     @property
     def lands(self) -> bool:

@@ -63,7 +63,6 @@ DEFAULTS: Final[dict[str, float | int]] = {
     "EKF2_GYR_NOISE": 0.015,
     "EKF2_HDG_GATE": 2.6,
     "EKF2_HGT_REF": 3,
-    "EKF2_NOAID_NOISE": 10.0,
     "EKF2_NOAID_TOUT": 5_000_000,
     "IMU_DGYRO_CUTOFF": 30.0,
     "IMU_GYRO_CUTOFF": 40.0,
@@ -139,7 +138,10 @@ DEFAULTS: Final[dict[str, float | int]] = {
 
 
 def airframe_defaults(airframe: Airframe) -> dict[str, float]:
-    """What the set-up script of this airframe sets: hover thrust, thrust curve, rate gains.
+    """What the set-up script of this airframe sets: hover thrust, thrust curve, gains.
+
+    Softer position gains than PX4's 0.95 and 0.4: with those a step of 5 m takes 1.9 s to 90 %
+    and overshoots by 0.6 m; with these 2.7 s and 0.15 m, as the flown autopilots did.
 
     The rate loops get the bandwidth 0.4/motor time, which with the motor's lag is a damping
     of 0.8; their gains are per unit of torque, so they depend on arm, thrust and inertia.
@@ -150,6 +152,8 @@ def airframe_defaults(airframe: Airframe) -> dict[str, float]:
     gain = bandwidth * airframe.inertia_kg_m2 / torque_n_m
     yaw = 0.4 * gain[2]
     return {
+        "MPC_XY_P": 0.65,
+        "MPC_XY_VEL_I_ACC": 0.2,
         "MPC_THR_HOVER": hover,
         "THR_MDL_FAC": airframe.thrust_curve,
         "MC_ROLLRATE_P": gain[0],
@@ -235,6 +239,8 @@ class ParameterService:
     def due(self) -> bytes:
         """The next piece of a list that was asked for."""
         first = self._next
+        if first >= len(self._parameters):
+            return b""
         self._next = min(first + self.PER_CALL, len(self._parameters))
         return b"".join(self._value(name) for name in self._parameters.names[first : self._next])
 
@@ -244,11 +250,7 @@ class ParameterService:
         if name not in self._parameters.names:
             return b""
         if kind == INT32:
-            value = (
-                struct.unpack("<i", struct.pack("<f", value))[0]
-                if self._parameters.is_integer(name)
-                else value
-            )
+            value = struct.unpack("<i", struct.pack("<f", value))[0] if self._parameters.is_integer(name) else value
         if kind == (INT32 if self._parameters.is_integer(name) else REAL32):
             self._parameters.set(name, value)
         return self._value(name)

@@ -1,4 +1,4 @@
-"""What is built into the simulated autopilot: the airframe it was set up for, its readings, its configuration."""
+"""What is built into the simulated autopilot: the airframe it flies, its readings, its configuration."""
 
 from __future__ import annotations
 
@@ -36,6 +36,20 @@ class GpsFix(NamedTuple):
     speed_sigma: float = 0.4  # m/s
     fix_type: int = 3  # MAVLink's GPS_FIX_TYPE; below 3 it is not fused
     satellites: int = 12
+
+
+class ExternalPose(NamedTuple):
+    """What the companion's ODOMETRY says; NaN where it says nothing."""
+
+    stamp_ns: int
+    p: Array  # m, (3,)
+    v: Array  # m/s, (3,)
+    v_in_body: bool
+    yaw: float
+    variance: Array  # p (3), v (3), yaw: (7,)
+    aligned_with_north: bool  # frame LOCAL_NED instead of LOCAL_FRD
+    reset_counter: int
+    quality: int
 
 
 class AutopilotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -25,7 +25,8 @@ from sim.autopilot.readings import GpsFix
 from sim.autopilot.setpoint import LOCAL_NED
 
 RATES_HZ: Final[dict[str, float]] = {
-    "HEARTBEAT": 1, "SYS_STATUS": 5, "SYSTEM_TIME": 1, "GPS_RAW_INT": 8, "SCALED_PRESSURE": 1, "ATTITUDE": 100,
+    "HEARTBEAT": 1, "SYS_STATUS": 5, "SYSTEM_TIME": 1, "GPS_RAW_INT": 8, "SCALED_PRESSURE": 1,
+    "ATTITUDE": 100,
     "ATTITUDE_QUATERNION": 50, "LOCAL_POSITION_NED": 30, "GLOBAL_POSITION_INT": 50, "SERVO_OUTPUT_RAW": 10,
     "MISSION_CURRENT": 1, "VFR_HUD": 10, "ATTITUDE_TARGET": 10, "POSITION_TARGET_LOCAL_NED": 10,
     "HIGHRES_IMU": 50, "TIMESYNC": 10, "DISTANCE_SENSOR": 10, "ALTITUDE": 10, "BATTERY_STATUS": 0.5,
@@ -67,8 +68,8 @@ class Telemetry:
     """Packs any message of `RATES_HZ` from the state of the parts: `telemetry.pack(msg_id)`."""
 
     def __init__(
-        self, clock: Clock, encoder: Encoder, estimator: Estimator, controller: Controller, commander: Commander,
-        *, readings: Readings, missions: MissionStore,
+        self, clock: Clock, encoder: Encoder, estimator: Estimator, controller: Controller,
+        *, commander: Commander, readings: Readings, missions: MissionStore,
     ) -> None:  # fmt: skip
         self._clock, self._encoder, self._estimator = clock, encoder, estimator
         self._controller, self._commander = controller, commander
@@ -98,7 +99,8 @@ class Telemetry:
     def _attitude_quaternion(self) -> bytes:
         e = self._estimator
         return self._encoder(
-            self._layouts["ATTITUDE_QUATERNION"], self._clock.ms, *e.q.tolist(), *e.omega.tolist(), 0.0, 0.0, 0.0, 0.0
+            self._layouts["ATTITUDE_QUATERNION"], self._clock.ms, *e.q.tolist(), *e.omega.tolist(),
+            0.0, 0.0, 0.0, 0.0,
         )  # fmt: skip
 
     def _highres_imu(self) -> bytes:
@@ -140,8 +142,9 @@ class Telemetry:
         speed = [max(-32767, min(32767, round(100 * v))) for v in e.v.tolist()]
         heading = round(math.degrees(euler_from_quaternion(e.q.tolist())[2]) % 360 * 100) % 36000
         return self._encoder(
-            self._layouts["GLOBAL_POSITION_INT"], self._clock.ms, round(latitude * 1e7), round(longitude * 1e7),
-            round(altitude * 1e3), round(1e3 * float(self._commander.home[2] - e.p[2])), *speed, heading,
+            self._layouts["GLOBAL_POSITION_INT"], self._clock.ms, round(latitude * 1e7),
+            round(longitude * 1e7), round(altitude * 1e3), round(1e3 * float(self._commander.home[2] - e.p[2])), *speed,
+            heading,
         )  # fmt: skip
 
     def _timesync(self) -> bytes:
@@ -152,7 +155,8 @@ class Telemetry:
     def _attitude_target(self) -> bytes:
         c = self._controller
         return self._encoder(
-            self._layouts["ATTITUDE_TARGET"], self._clock.ms, *c.attitude_setpoint, *c.rate_setpoint, c.thrust, 0
+            self._layouts["ATTITUDE_TARGET"], self._clock.ms, *c.attitude_setpoint, *c.rate_setpoint,
+            c.thrust, 0,
         )  # fmt: skip
 
     def _position_target_local_ned(self) -> bytes:
@@ -171,8 +175,8 @@ class Telemetry:
         e = self._estimator
         heading = round(math.degrees(euler_from_quaternion(e.q.tolist())[2]) % 360) % 360
         return self._encoder(
-            self._layouts["VFR_HUD"], NAN, math.hypot(e.v[0], e.v[1]), self.origin[2] - e.p[2], -e.v[2], heading,
-            round(100 * self._controller.thrust),
+            self._layouts["VFR_HUD"], NAN, math.hypot(e.v[0], e.v[1]), self.origin[2] - e.p[2], -e.v[2],
+            heading, round(100 * self._controller.thrust),
         )  # fmt: skip
 
     def _altitude(self) -> bytes:
@@ -181,7 +185,8 @@ class Telemetry:
         above_sea = self.origin[2] + local if self.origin_known else NAN
         relative = float(self._commander.home[2]) + local if self._commander.home_set else NAN
         return self._encoder(
-            self._layouts["ALTITUDE"], self._clock.us, e.baro_altitude, above_sea, local, relative, NAN, e.range_m
+            self._layouts["ALTITUDE"], self._clock.us, e.baro_altitude, above_sea, local, relative, NAN,
+            e.range_m,
         )  # fmt: skip
 
     def _distance_sensor(self) -> bytes:
@@ -242,8 +247,8 @@ class Telemetry:
         r = e.test_ratios.tolist()
         sigma = np.sqrt(e.P.diagonal()[6:9])
         return self._encoder(
-            self._layouts["ESTIMATOR_STATUS"], self._clock.us, max(r[3], r[4]), max(r[0], r[1]), r[2], r[6], NAN, NAN,
-            math.hypot(sigma[0], sigma[1]), sigma[2], e.flags,
+            self._layouts["ESTIMATOR_STATUS"], self._clock.us, max(r[3], r[4]), max(r[0], r[1]), r[2], r[6],
+            NAN, NAN, math.hypot(sigma[0], sigma[1]), sigma[2], e.flags,
         )  # fmt: skip
 
     def _home_position(self) -> bytes:
@@ -252,8 +257,8 @@ class Telemetry:
             return b""
         latitude, longitude, altitude = geodetic(self.origin, c.home)
         return self._encoder(
-            self._layouts["HOME_POSITION"], round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3),
-            *c.home, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self._clock.us,
+            self._layouts["HOME_POSITION"], round(latitude * 1e7), round(longitude * 1e7),
+            round(altitude * 1e3), *c.home, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self._clock.us,
         )  # fmt: skip
 
     def _gps_raw_int(self) -> bytes:
@@ -277,9 +282,7 @@ class Telemetry:
         if not math.isfinite(altitude):
             return b""
         celsius = round(100 * self._readings.temperature_c)
-        return self._encoder(
-            self._layouts["SCALED_PRESSURE"], self._clock.ms, _pressure_hpa(altitude), 0.0, celsius, 0
-        )
+        return self._encoder(self._layouts["SCALED_PRESSURE"], self._clock.ms, _pressure_hpa(altitude), 0.0, celsius, 0)
 
     def _system_time(self) -> bytes:
         return self._encoder(self._layouts["SYSTEM_TIME"], 0, self._clock.ms)
