@@ -6,8 +6,8 @@ The comments come from the sources: the string under a field, or the comment bes
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
-import json
 import re
 import textwrap
 from collections.abc import Iterator
@@ -30,6 +30,7 @@ def dump_struct(struct: msgspec.Struct, *, root: str = "") -> str:
     return "\n".join([f"{root}:", *_lines(struct, 1)]) + "\n"
 
 
+@functools.cache
 def field_docs(cls: type[Any]) -> dict[str, str]:
     """What the source says of each field of a struct or dataclass; '' where nothing."""
     docs: dict[str, str] = {}
@@ -50,7 +51,7 @@ def _lines(struct: msgspec.Struct, depth: int) -> Iterator[str]:
         if isinstance(value, msgspec.Struct):
             doc = docs.get(field.name) or (inspect.getdoc(type(value)) or "").split("\n")[0]
             yield from _comment(doc, depth)
-            yield f"{_indent(depth)}{name}:"
+            yield f"{_indent(depth)}{name}:" + ("" if value.__struct_fields__ else " {}")
             yield from _lines(value, depth + 1)
             continue
         kind = describe(field.type, unit_of(name, field.type))
@@ -85,7 +86,7 @@ def _flow(value: Any) -> str:
         return str(value)
     if isinstance(value, str):
         plain = _PLAIN.fullmatch(value) and yaml.safe_load(value) == value and value == value.strip()
-        return value if plain else json.dumps(value)
+        return value if plain else yaml.safe_dump(value, default_style='"', width=10**9).rstrip("\n")
     if isinstance(value, msgspec.Struct):
         value = {name: getattr(value, name) for name in value.__struct_fields__}
     if isinstance(value, dict):

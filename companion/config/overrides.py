@@ -47,9 +47,7 @@ def _plant(tree: Tree, text: str) -> None:
 def _changed(value: Any, tree: Tree, path: Path) -> Any:
     if isinstance(value, msgspec.Struct):
         return _changed_struct(value, tree, path)
-    raise InputError(
-        f"has no parts, it is {value!r}", field=path_text(path), valid=f"{path_text(path)}=VALUE"
-    )
+    raise InputError(f"has no parts, it is {value!r}", field=path_text(path), valid=f"{path_text(path)}=VALUE")
 
 
 def _changed_struct(struct: msgspec.Struct, tree: Tree, path: Path) -> msgspec.Struct:

@@ -49,8 +49,8 @@ def test_the_readme_names_every_key_of_every_verb():
     text = README.read_text()
     common = set(schema.Step.__struct_fields__)
     for step in schema.Step.__subclasses__():
-        row = re.search(rf"^\| {step.__struct_config__.tag} \| (.*?) \|", text, re.M)
-        named = set(re.findall(r"\b[a-z_]+\b(?= \(|,|$)", re.sub(r"\([^)]*\)", "()", row[1])))
+        row = next(r for r in text.splitlines() if r.startswith(f"| {step.__struct_config__.tag} |"))
+        named = set(re.findall(r"[a-z_]+", re.sub(r"\(.*?\)", "", row.split("|")[2])))
         assert named == set(step.__struct_fields__) - common
 
 
