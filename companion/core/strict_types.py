@@ -27,8 +27,8 @@ _UNITS = {
 
 def path_text(path: Path) -> str:
     """('steps', 2, 'at') -> 'steps[2].at'."""
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
-    return "".join(parts).removeprefix(".")
+    words = (p if isinstance(p, int) or p.isprintable() else repr(p) for p in path)
+    return "".join(f"[{w}]" if isinstance(w, int) else f".{w}" for w in words).removeprefix(".")
 
 
 def unit_of(name: str, kind: mi.Type) -> str:

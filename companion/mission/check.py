@@ -64,9 +64,7 @@ def _check_ids(document: Document, mission: Mission) -> None:
         name = mission.id_of(index)
         if name in seen:
             line = document.line_of(("steps", seen[name]))
-            raise document.error(
-                ("steps", index, "id"), f"{name} is taken by line {line}", valid="another id"
-            )
+            raise document.error(("steps", index, "id"), f"{name} is taken by line {line}", valid="another id")
         seen[name] = index
 
 
@@ -88,9 +86,7 @@ def _check_polygon(document: Document, path: Path, polygon: tuple[tuple[float, f
     crossing = crossing_edges(polygon)
     if crossing is not None:
         i, j = crossing
-        raise document.error(
-            (*path, j), f"edge {j} crosses edge {i}", valid="corners in order, without crossing"
-        )
+        raise document.error((*path, j), f"edge {j} crosses edge {i}", valid="corners in order, without crossing")
     if area_m2(polygon) < 1.0:
         raise document.error(path, f"covers {area_m2(polygon):.2f} m2", valid="at least 1 m2")
 
@@ -167,12 +163,8 @@ def _check_inside(document: Document, mission: Mission, index: int) -> None:
         depth_m = fence.depth_m(leg.p)
         if leg.frame != "body" and depth_m <= 0:
             path: Path = ("steps", index, *_key_of_leg(step, k))
-            problem = (
-                f"({leg.p[0]:.1f}, {leg.p[1]:.1f}, {leg.p[2]:.1f}) is {-depth_m:.1f} m outside the fence"
-            )
-            raise document.error(
-                path, problem, valid=f"inside geofence, line {document.line_of(('geofence',))}"
-            )
+            problem = f"({leg.p[0]:.1f}, {leg.p[1]:.1f}, {leg.p[2]:.1f}) is {-depth_m:.1f} m outside the fence"
+            raise document.error(path, problem, valid=f"inside geofence, line {document.line_of(('geofence',))}")
 
 
 def _key_of_leg(step: object, leg: int) -> Path:

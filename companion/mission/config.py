@@ -28,6 +28,8 @@ class MissionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """... plus this."""
     progress_m: Annotated[float, msgspec.Meta(gt=0)] = 1.0
     """Staying within this distance for planner_stuck.after_s counts as stuck."""
+    leg_m: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 10.0
+    """Longer survey lanes are split, so that each goal takes the newest map correction."""
     lookahead_goals: Annotated[int, msgspec.Meta(ge=0, le=20)] = 3
     """Goals that follow, sent along for looking ahead."""
     settle_speed_m_s: Annotated[float, msgspec.Meta(gt=0)] = 0.3

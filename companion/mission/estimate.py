@@ -80,9 +80,7 @@ def _row(mission: Mission, index: int, legs: tuple[Leg, ...], start: Array) -> t
 
 def _points(legs: tuple[Leg, ...], start: Array) -> list[Array]:
     """Goals in the home frame; body goals as if the vehicle looked along +x."""
-    return [
-        leg.p + start * (1.0, 1.0, math.isnan(leg.agl_m)) if leg.frame == "body" else leg.p for leg in legs
-    ]
+    return [leg.p + start * (1.0, 1.0, math.isnan(leg.agl_m)) if leg.frame == "body" else leg.p for leg in legs]
 
 
 def _lands(step: AnyStep) -> bool:

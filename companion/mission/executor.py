@@ -155,7 +155,7 @@ class Executor:
         step = self._mission.steps[index]
         places = Places.at(self._odometry, self._correction, self._home)
         xy = places.p_map_start - self._home
-        legs = legs_of(self._mission, step, (float(xy[0]), float(xy[1])))
+        legs = legs_of(self._mission, step, (float(xy[0]), float(xy[1])), leg_m=self._config.leg_m)
         self._run = Run(legs, places, step, now_ns + round(self._timeouts_s[index] * 1e9))
         yield self._why(now_ns, f"step {self._mission.id_of(index)}", f"number {index + 1} is next")
         if isinstance(step, Land):

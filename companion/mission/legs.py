@@ -27,9 +27,7 @@ class Run:
     anchor_ns: int = 0  # since when the vehicle is near the anchor
     blocked_ns: int | None = None  # since when the planner finds no way
 
-    def goal(
-        self, now_ns: int, goal_id: int, correction: Correction, limits: Limits, *, lookahead: int
-    ) -> Goal:
+    def goal(self, now_ns: int, goal_id: int, correction: Correction, limits: Limits, *, lookahead: int) -> Goal:
         """The present leg as a goal in odom, by the newest correction."""
         leg = self.legs[self.index]
         following = self.legs[self.index + 1 : self.index + 1 + lookahead]
@@ -55,9 +53,7 @@ class Run:
         """Start watching for progress from here."""
         self.anchor_odom, self.anchor_ns, self.blocked_ns = p_odom, now_ns, None
 
-    def problem(
-        self, now_ns: int, p_odom: Array, plan: PlanStatus | None, *, stuck_s: float, progress_m: float
-    ) -> str:
+    def problem(self, now_ns: int, p_odom: Array, plan: PlanStatus | None, *, stuck_s: float, progress_m: float) -> str:
         """What is wrong with the present goal; '' if nothing. `plan`: only the present goal's."""
         if plan is None or plan.state != "blocked":
             self.blocked_ns = None

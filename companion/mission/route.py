@@ -33,8 +33,11 @@ class Leg:
     kind: Literal["takeoff", "fly"] = "fly"
 
 
-def legs_of(mission: Mission, step: AnyStep, start_xy: tuple[float, float]) -> tuple[Leg, ...]:
-    """Goals of one step, begun near `start_xy` (home frame); none for hover and land."""
+def legs_of(mission: Mission, step: AnyStep, start_xy: tuple[float, float], *, leg_m: float = LEG_M) -> tuple[Leg, ...]:
+    """Goals of one step, begun at `start_xy` (home frame); none for hover and land.
+
+    Survey lanes, and the way to the first, are split into stretches of `leg_m` at most.
+    """
     match step:
         case Takeoff():
             return (Leg(p=np.array([0.0, 0.0, step.alt]), radius_m=HOME_RADIUS_M, kind="takeoff"),)
@@ -43,7 +46,7 @@ def legs_of(mission: Mission, step: AnyStep, start_xy: tuple[float, float]) -> t
         case FollowPath():
             return _follow(step)
         case Survey():
-            return _survey(step, start_xy)
+            return _survey(step, start_xy, leg_m)
         case ReturnHome():
             return (home_leg(mission),)
         case _:
@@ -84,18 +87,16 @@ def _follow(step: FollowPath) -> tuple[Leg, ...]:
     )
 
 
-def _survey(step: Survey, start_xy: tuple[float, float]) -> tuple[Leg, ...]:
-    path = split(
-        survey_path(
-            step.area,
-            spacing_m=step.spacing,
-            heading_rad=None if step.heading_deg == "auto" else math.radians(step.heading_deg),
-            crosshatch=step.pattern == "crosshatch",
-            start_xy=start_xy,
-        ),
-        LEG_M,
+def _survey(step: Survey, start_xy: tuple[float, float], leg_m: float) -> tuple[Leg, ...]:
+    lanes = survey_path(
+        step.area,
+        spacing_m=step.spacing,
+        heading_rad=None if step.heading_deg == "auto" else math.radians(step.heading_deg),
+        crosshatch=step.pattern == "crosshatch",
+        start_xy=start_xy,
     )
-    through = _straight(path)
+    path = split(np.vstack([start_xy, lanes]), leg_m)
+    through = _straight(path)[1:]
     return tuple(
         Leg(
             p=np.array([x, y, step.agl]),
@@ -105,7 +106,7 @@ def _survey(step: Survey, start_xy: tuple[float, float]) -> tuple[Leg, ...]:
             fly_through=bool(through[k]),
             if_blocked="nearest_free" if step.skip_unreachable else "fail",
         )
-        for k, (x, y) in enumerate(path)
+        for k, (x, y) in enumerate(path[1:])
     )
 
 

@@ -88,9 +88,7 @@ def serpentine(segments: Array) -> Array:
 
 def _same_line(a: Array, b: Array, direction: Array) -> bool:
     offset = b[0] - a[0]
-    return abs(float(direction[0] * offset[1] - direction[1] * offset[0])) < 1e-6 * float(
-        np.hypot(*direction)
-    )
+    return abs(float(direction[0] * offset[1] - direction[1] * offset[0])) < 1e-6 * float(np.hypot(*direction))
 
 
 def _from_nearest_end(path: Array, start: Array) -> Array:
