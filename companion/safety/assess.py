@@ -119,9 +119,7 @@ def _always(h: Health, c: SafetyConfig) -> Iterator[Verdict]:
 
 
 def _estimate(h: Health, c: SafetyConfig) -> Iterator[Verdict]:
-    yield from _graded(
-        h.measured_age_s, "s", "dead reckoning for", hold=c.measured_hold_s, land=c.measured_land_s
-    )
+    yield from _graded(h.measured_age_s, "s", "dead reckoning for", hold=c.measured_hold_s, land=c.measured_land_s)
     yield from _graded(
         h.position_std_m,
         "m",
@@ -138,9 +136,7 @@ def _sensing(h: Health, c: SafetyConfig) -> Iterator[Verdict]:
     yield from _graded(
         h.lidar_age_s, "s", "LiDAR update age", slow=c.lidar_slow_s, hold=c.lidar_hold_s, land=c.lidar_land_s
     )
-    yield from _graded(
-        h.map_age_s, "s", "local map age", slow=c.map_slow_s, hold=c.map_hold_s, land=c.map_land_s
-    )
+    yield from _graded(h.map_age_s, "s", "local map age", slow=c.map_slow_s, hold=c.map_hold_s, land=c.map_land_s)
 
 
 def _fence(h: Health, c: SafetyConfig) -> Iterator[Verdict]:

@@ -98,7 +98,7 @@ class SafetyNode(Node):
             measured_age_s=_age_s(now_ns, odometry.measured_ns if odometry else None),
             lidar_age_s=self._age_in_air_s(now_ns, self._lidar_ns),
             map_age_s=self._age_in_air_s(now_ns, self._map_ns),
-            position_std_m=float(np.sqrt(odometry.pose_variance[3:].max())) if odometry else math.inf,
+            position_std_m=float(np.sqrt(np.maximum(odometry.pose_variance[3:], 0).max())) if odometry else math.inf,
             quality=odometry.quality if odometry else 0.0,
             battery_fraction=vehicle.battery_fraction if vehicle else math.nan,
             fence_depth_m=depth_m,

@@ -9,6 +9,7 @@ import yaml
 from typer.testing import CliRunner
 
 from companion.cli import mission as cli
+from companion.core.errors import InputError
 from companion.mission import schema
 from companion.mission.estimate import estimate, total_time_s, travel_time_s
 from companion.mission.model import parse_mission
@@ -68,6 +69,24 @@ def test_check_prints_a_table_or_json():
     assert [s["do"] for s in data["steps"]] == ["takeoff", "goto", "land"]
     assert data["length_m"] == pytest.approx(10.0)
     assert run(cli.check, file, "--quiet").stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"version: 1\n", ":1: name: is missing"),
+        (b"\xff\xfe\x00", "not UTF-8 text (valid: a YAML text file)"),
+        (None, "No such file or directory (valid: a YAML text file)"),
+    ],
+)
+def test_check_ends_wrong_files_with_exit_code_2(tmp_path, content, message):
+    """The command raises a CompanionError; `companion.cli.main` prints its one line and exits."""
+    file = tmp_path / "m.yaml"
+    if content is not None:
+        file.write_bytes(content)
+    error = run(cli.check, file).exception
+    assert isinstance(error, InputError) and error.exit_code == 2
+    assert str(error).startswith(str(file)) and message in str(error)
 
 
 @pytest.mark.parametrize(("length", "speed", "accel"), [(10, 2, 3), (0.5, 2, 3), (4 / 3, 2, 3), (0, 1, 1)])
