@@ -165,7 +165,9 @@ class Commander:
             self._choose_demand(dt)
             self.flight.fly(self.demand, dt)
             if self.mode is Mode.TAKEOFF and self._arrived():
+                top = self.guidance.target.copy()
                 self._enter(Mode.HOLD)
+                self.guidance.go(top, math.nan)
 
     def motors(self, dt: float) -> Array:
         """Commands of this instant, (4,)."""

@@ -19,6 +19,7 @@ from sim.autopilot.telemetry import Telemetry
 # MAVLINK2, MISSION_FENCE, MISSION_RALLY.
 CAPABILITIES: Final = 4 | 8 | 16 | 128 | 8192 | 16384 | 32768
 VERSION: Final = 0x01120000 | 255  # 1.18.0, release
+FARTHEST_M: Final = 1e5  # no place beyond is flown to
 INT32_UNSET: Final = 0x7FFFFFFF
 LOCAL_FRAMES: Final = (1, 20)
 
@@ -105,28 +106,32 @@ class Commands:
 
     def _reposition(self, c: Command) -> Result:
         target = self._place(c)
+        if (np.abs(target) > FARTHEST_M).any():
+            return Result.DENIED
         return self._commander.reposition(c.now_ns, target, c.params[3])
 
     def _set_home(self, c: Command) -> Result:
         home = self._commander.position.copy() if c.params[0] == 1.0 else self._place(c)
-        if not np.isfinite(home).all():
+        if not (np.abs(home) < FARTHEST_M).all():
             return Result.DENIED
         self._commander.home[:], self._commander.home_set = home, True
         self._send(242)
         return Result.ACCEPTED
 
     def _set_origin(self, c: Command) -> Result:
-        if not c.integer or c.params[4] == INT32_UNSET:
+        if not c.integer:
             return Result.DENIED
-        self.set_origin(c.params[4] * 1e-7, c.params[5] * 1e-7, c.params[6])
-        return Result.ACCEPTED
+        return self.set_origin(c.params[4] * 1e-7, c.params[5] * 1e-7, c.params[6])
 
-    def set_origin(self, latitude: float, longitude: float, altitude: float) -> None:
+    def set_origin(self, latitude: float, longitude: float, altitude: float) -> Result:
         """Where the local frame's origin lies on Earth; announced by GPS_GLOBAL_ORIGIN."""
+        if not (abs(latitude) < 89.0 and abs(longitude) <= 180.0 and abs(altitude) < FARTHEST_M):
+            return Result.DENIED
         self._telemetry.origin = latitude, longitude, altitude
         self._telemetry.origin_known = True
         scaled = round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
         self.extra += self._encoder(BY_NAME["GPS_GLOBAL_ORIGIN"], *scaled, self._commander.now_ns // 1000)
+        return Result.ACCEPTED
 
     def _place(self, c: Command) -> Any:
         """Target NED of parameters 5-7; unset components are NaN."""

@@ -22,6 +22,7 @@ GRAVITY: Final = 9.80665
 IDLE_COMMAND: Final = 0.08  # armed on the ground: rotors just turn
 CONTACT_S: Final = 0.35
 LANDED_S: Final = 1.0
+CLEAR_M: Final = 0.2  # height at which the legs are free
 
 
 class Phase(Enum):
@@ -79,7 +80,8 @@ class Flight:
         self.has_flown = False
         self._since_arming_s = self._ramp_s = 0.0
         self.on_ground_s = 0.0
-        self._limits = np.zeros(3)
+        self._ground_z = 0.0
+        self._limits, self._level = np.zeros(3), np.zeros(SIZE)
         self._touchdown = np.full(SIZE, np.nan)
         self._touchdown[A] = 0.0, 0.0, 100.0  # PX4's own way to say: no thrust
 
@@ -96,7 +98,7 @@ class Flight:
 
     def lift(self) -> None:
         """Begin the take-off ramp."""
-        self.phase, self._ramp_s = Phase.RAMP, 0.0
+        self.phase, self._ramp_s, self._ground_z = Phase.RAMP, 0.0, float(self._estimator.p[2])
         self._controller.reset()
         self.detector.reset()
 
@@ -114,13 +116,24 @@ class Flight:
                 self.phase = Phase.FLIGHT
         contact = self.phase is Phase.FLIGHT and self.detector.contact
         self._limits[:] = self._climb_limit(), self._tilt_limit(contact), self._integrators(contact)
-        demand = self._touchdown if contact else setpoint
+        demand = self._touchdown if contact else self._straight_up(setpoint)
         e = self._estimator
         self._controller.position(demand, e.x, e.acceleration, self._limits, dt)
         if self.landed and self._controller.thrust > 0.7 * self._controller.hover_thrust:
             self.landed, self.has_flown = False, True
         if self.phase is Phase.FLIGHT:
             self._notice_landing(setpoint, contact, dt)
+
+    def _straight_up(self, setpoint: Array) -> Array:
+        """The setpoint; without its horizontal part until the legs are off the ground, or it would tip over."""
+        risen = self._ground_z - self._estimator.p[2] > CLEAR_M
+        if risen or self.phase is Phase.FLIGHT:
+            self._ground_z = math.inf
+            return setpoint
+        self._level[:] = setpoint
+        self._level[[0, 1, 3, 4]] = np.nan
+        self._level[[6, 7]] = 0.0
+        return self._level
 
     def _notice_landing(self, setpoint: Array, contact: bool, dt: float) -> None:
         if contact and wants_up(setpoint, self._estimator.p):

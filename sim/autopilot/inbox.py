@@ -72,7 +72,7 @@ class Inbox:
 
     def _for_us(self, frame: Frame) -> bool:
         named = frame.named
-        return named["target_system"] in (0, self._system) and named.get("target_component", 0) in (0, 1)
+        return named.get("target_system", -1) in (0, self._system) and named.get("target_component", 0) in (0, 1)
 
     def _setpoint(self, now_ns: int, frame: Frame) -> None:
         values = frame.values

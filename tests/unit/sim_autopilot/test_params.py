@@ -79,7 +79,7 @@ def test_a_set_with_the_wrong_type_or_no_number_changes_nothing(service, paramet
 
 
 def test_a_misspelt_override_is_named_with_its_neighbours():
-    with pytest.raises(InputError, match="MPC_XY_PP.*MPC_XY_P"):
+    with pytest.raises(InputError, match=r"MPC_XY_PP.*MPC_XY_P"):
         Parameters({"MPC_XY_PP": 1.0})
 
 
