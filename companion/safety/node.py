@@ -28,7 +28,7 @@ class SafetyNode(Node):
 
     publishes = (topics.SAFETY, topics.WHY)
 
-    def __init__(self, config: SafetyConfig, *, fence: Fence | None = None) -> None:
+    def __init__(self, config: SafetyConfig, *, fence: Fence | None) -> None:
         self._config, self._fence = config, fence
         self._odometry: Odometry | None = None
         self._vehicle: VehicleStatus | None = None
