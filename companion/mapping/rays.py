@@ -77,7 +77,8 @@ class RayGrid:
 
     def mark_free(self, points_odom: Array) -> None:
         """Set the free bit of the voxels that hold the points (K, 3), m; outside: ignored."""
-        cell = np.floor(points_odom / self.resolution_m).astype(np.int64) - BLOCK * self.corner
+        points = points_odom[np.all(np.abs(points_odom) < 1e9, axis=1)]  # NaN fails, too
+        cell = np.floor(points / self.resolution_m).astype(np.int64) - BLOCK * self.corner
         cell = cell[np.all((cell >= 0) & (cell < BLOCK * self.side), axis=1)]
         index = cell @ self._strides[0] + (cell >> 3) @ self._strides[1]
         np.bitwise_or.at(self.free, index >> 6, np.uint64(1) << (index & 63).astype(np.uint64))
@@ -87,7 +88,8 @@ class RayGrid:
 
     def met(self) -> NDArray[np.int64]:
         """Numbers of the scratch blocks with any bit, ascending."""
-        low, high = self._reached >> 3
+        around = self._reached + np.array([[-1], [1]])  # rounding at a border may cost one cell
+        low, high = np.clip(around >> 3, 0, self.side - 1)
         found = np.empty(int(np.prod(high - low + 1)), np.int64)
         return found[: _met(self.free.reshape(-1, WORDS), self.side, low, high, found)]
 
@@ -103,8 +105,8 @@ def _cast(vectors, pose, ranges, bits, row, strides):  # type: ignore[no-untyped
     x_stride = (u32(strides[0, 0]), u32(strides[1, 0]))
     y_stride = (u32(strides[0, 1]), u32(strides[1, 1]))
     z_stride = (u32(strides[0, 2]), u32(strides[1, 2]))
-    lx, ly, lz = reached[0, 0], reached[0, 1], reached[0, 2]
-    hx, hy, hz = reached[1, 0], reached[1, 1], reached[1, 2]
+    lx, ly, lz = min(reached[0, 0], ix), min(reached[0, 1], iy), min(reached[0, 2], iz)
+    hx, hy, hz = max(reached[1, 0], ix), max(reached[1, 1], iy), max(reached[1, 2], iz)
     used = steps = end = 0
     for i in range(vectors.shape[0]):
         a, b, c = np.float64(vectors[i, 0]), np.float64(vectors[i, 1]), np.float64(vectors[i, 2])

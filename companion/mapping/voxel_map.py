@@ -18,6 +18,7 @@ from companion.mapping.sensor_model import UNKNOWN, SensorModel, quantise
 
 UNKNOWN_CELL, FREE_CELL, OCCUPIED_CELL = 0, 1, 2  # as in core.messages.LocalMap.state
 _FARTHEST_M = 1e5  # where a float32 still tells centimetres, and far inside the hash's range
+_FARTHEST_BLOCKS = 64  # of a ray: 300 MB of scratch, and bit numbers fit 32 bits
 _NO_POINTS = np.empty((0, 3))
 _NO_VECTORS = np.empty((0, 3), np.float32)
 _Metres = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -38,11 +39,11 @@ class VoxelMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
                 field="mapping.voxels.miss_clear_range_m",
                 valid=f"up to {self.max_range_m} m",
             )
-        if self.max_range_m > 200 * BLOCK * self.resolution_m:
+        if self.max_range_m > _FARTHEST_BLOCKS * BLOCK * self.resolution_m:
             raise InputError(
                 f"{self.max_range_m} m is too far for voxels of {self.resolution_m} m",
                 field="mapping.voxels.max_range_m",
-                valid=f"up to {200 * BLOCK * self.resolution_m:g} m",
+                valid=f"up to {_FARTHEST_BLOCKS * BLOCK * self.resolution_m:g} m",
             )
 
 

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pyoctomap import OcTree
 
 from companion.core.errors import InputError
@@ -42,6 +44,9 @@ def amanatides_woo(start, end, cell_m):
         seen.append(tuple(int(c) for c in cell))
     assert seen[-1] == tuple(last)
     return seen
+
+
+_SHARED = small()
 
 
 def random_rotation(rng):
@@ -231,7 +236,7 @@ def test_free_points_make_free_unless_hit():
     voxels = small()
     here, struck = ORIGIN + np.array([0.0, 0.0, -1.0]), ORIGIN + np.array([1.0, 0.0, 0.0])
     far_outside = ORIGIN + np.array([500.0, 0.0, 0.0])
-    look(voxels, struck, free_odom=np.array([here, struck, far_outside]))
+    look(voxels, struck, free_odom=np.array([here, struck, far_outside, [np.nan, 0.0, 0.0]]))
     assert voxels.classify(np.array([here, struck, far_outside])).tolist() == [1, 2, 0]
 
 
@@ -308,7 +313,22 @@ def test_bad_poses_shapes_and_configs_are_refused():
         voxels.insert(look_shape, R_odom_body=np.eye(3), p_odom=np.zeros(3), origin_odom=np.zeros(3))
     with pytest.raises(InputError, match="miss_clear_range_m"):
         VoxelMapConfig(max_range_m=5.0, miss_clear_range_m=6.0)
+    with pytest.raises(InputError, match="max_range_m"):
+        VoxelMapConfig(max_range_m=60.0, resolution_m=0.1)
     assert voxels.block_count == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_nothing_of_a_scan_is_left_behind_for_the_next(seed):
+    """Rays along borders, edges and corners of voxels and blocks: the scratch must be empty after each."""
+    rng = np.random.default_rng(seed)
+    voxels = _SHARED
+    origin = 0.2 * rng.choice([0, 1, 4, 7, 8, 16], 3) * rng.choice([-1, 1], 3)
+    ends = origin + 0.2 * rng.integers(-40, 41, (200, 3)) * rng.choice([0.0, 1.0, 1.0 + 1e-7], (200, 3))
+    look(voxels, ends, origin=origin, misses=rng.integers(-1, 2, (50, 3)).astype(np.float32), free_odom=ends)
+    assert not voxels._grid.free.any()
+    assert not voxels._grid.hit.any()
 
 
 def test_the_same_scans_give_the_same_bytes():
