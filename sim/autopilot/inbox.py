@@ -177,8 +177,8 @@ class Inbox:
 
 
 def _finite(array: np.ndarray) -> np.ndarray:
-    """Infinities to NaN, which means "not given"."""
-    array[~np.isfinite(array)] = np.nan
+    """Infinities and what cannot be (over 1000 km) to NaN, which means "not given"."""
+    array[~(np.abs(array) < 1e6)] = np.nan
     return array
 
 

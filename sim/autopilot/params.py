@@ -7,7 +7,6 @@ Values travel "bytewise": the bits of an INT32 in the float field.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Mapping
 from difflib import get_close_matches
@@ -136,6 +135,23 @@ DEFAULTS: Final[dict[str, float | int]] = {
 }
 """An int default makes an INT32 parameter. Vision-only defaults: EV_CTRL 15, HGT_REF 3, no GPS."""
 
+RANGES: Final[dict[str, tuple[float, float]]] = {
+    "BAT1_N_CELLS": (1, 16),
+    "IMU_DGYRO_CUTOFF": (1.0, 1000.0),
+    "IMU_GYRO_CUTOFF": (1.0, 1000.0),
+    "MPC_THR_HOVER": (0.1, 0.8),
+    "MPC_THR_MAX": (0.1, 1.0),
+    "MPC_THR_MIN": (0.0, 0.5),
+    "MPC_TILTMAX_AIR": (10.0, 80.0),
+    "MPC_TILTMAX_LND": (5.0, 80.0),
+    "MPC_VELD_LP": (0.1, 1000.0),
+    "MPC_XY_VEL_P_ACC": (0.2, 15.0),
+    "MPC_Z_VEL_P_ACC": (0.2, 15.0),
+    "THR_MDL_FAC": (0.0, 1.0),
+    **{name: (1e-4, 20.0) for name in DEFAULTS if name.startswith("EKF2_") and name.endswith("_NOISE")},
+}
+"""Values that control laws and filter cannot do without; all others: not negative, below 1e9."""
+
 
 def airframe_defaults(airframe: Airframe) -> dict[str, float]:
     """What the set-up script of this airframe sets: hover thrust, thrust curve, gains.
@@ -193,8 +209,9 @@ class Parameters:
         return isinstance(DEFAULTS[name], int)
 
     def set(self, name: str, value: float) -> bool:
-        """Set a value as PARAM_SET does; False if there is no such parameter or it is no number."""
-        if name not in self._values or not math.isfinite(value):
+        """Set a value as PARAM_SET does; False if there is no such parameter or the value is out of range."""
+        low, high = RANGES.get(name, (0.0, 1e9))
+        if name not in self._values or not low <= value <= high:
             return False
         self._values[name] = int(value) if self.is_integer(name) else float(np.float32(value))
         self.version += 1
@@ -203,7 +220,7 @@ class Parameters:
     def _override(self, name: str, value: float) -> None:
         if not self.set(name, value):
             near = ", ".join(get_close_matches(name, self.names)) or "see sim/autopilot/params.py"
-            raise InputError(f"no such parameter, or not a number: {value}", field=name, valid=near)
+            raise InputError(f"no such parameter, or {value} is out of its range", field=name, valid=near)
 
     def wire_value(self, name: str) -> tuple[float, int]:
         """Value bytewise in a float, and its MAV_PARAM_TYPE."""

@@ -39,6 +39,7 @@ class Streams:
             return False
         self._queue = [entry for entry in self._queue if entry[1] != msg_id]
         self.period_ns.pop(msg_id, None)
+        interval_us = min(interval_us, 2.0**31 - 1)  # what MESSAGE_INTERVAL can say
         period = self._default.get(msg_id, 0) if interval_us == 0 else max(round(interval_us * 1e3), 2_500_000)
         if interval_us >= 0 and period > 0:
             self.period_ns[msg_id] = period

@@ -172,7 +172,7 @@ class Bench:
         self.run(0.3)
         assert self.command(176, 1, 6, 0) == 0
         assert self.command(400, 1) == 0
-        self.run(10.0)
+        self.run(7.5)
 
 
 def rotation(q):
