@@ -1,0 +1,1 @@
+"""Planning: local maps and goals in, trajectories out."""

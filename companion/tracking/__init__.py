@@ -1,0 +1,1 @@
+"""Tracking: trajectories in, setpoints out."""

@@ -1,0 +1,251 @@
+"""RRT* in 3D: anytime, informed, seeded with what is known.
+
+>>> plan = RRTStar(RRTStarConfig()).plan(start, goal, space, rng=np.random.default_rng(1), iterations=1000)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.core.messages import Array
+from companion.planning import connect as two_trees
+from companion.planning import grow, shortcut
+from companion.planning.polyline import length, without_repeats
+from companion.planning.space import FieldSpace
+from companion.planning.tree import COST, NEVER, add, way_to
+
+_PATH_POINTS = 2048
+_SPARE_NODES = 2048  # for chains of known and shortened paths
+
+
+class RRTStarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How the tree grows."""
+
+    step_m: Annotated[float, msgspec.Meta(gt=0)] = 6.0
+    """Longest new edge."""
+    first: bool = True
+    """Find the first path with RRT-Connect; false: RRT* alone, with goal bias."""
+    goal_bias: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.1
+    """Share of samples at the goal while RRT* has no path."""
+    local_share: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.4
+    """Share of samples around the best path."""
+    local_width_m: Annotated[float, msgspec.Meta(gt=0)] = 6.0
+    """Widest box around the best path for these."""
+    radius_factor: Annotated[float, msgspec.Meta(ge=1)] = 1.1
+    """Neighbourhood radius over the least one with proven convergence."""
+    chunk: Annotated[int, msgspec.Meta(ge=10)] = 100
+    """Iterations between two rounds of shortening."""
+    shortcuts: Annotated[int, msgspec.Meta(ge=0)] = 60
+    """Attempts per round of shortening."""
+    bucket_m: Annotated[float, msgspec.Meta(gt=0)] = 2.4
+    """Edge of the nearest-neighbour buckets."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plan:
+    """What a planner found. Unsolved: the way to the reached place nearest to the goal."""
+
+    path: Array  # (N, 3), odom, m
+    cost_m: float  # length; infinite if unsolved
+    iterations: int
+    solved: bool
+
+
+class RRTStar:
+    """Keeps only scratch memory, so a plan depends on its arguments alone."""
+
+    def __init__(self, config: RRTStarConfig) -> None:
+        self.config = config
+        self._memory: _Memory | None = None
+
+    def plan(
+        self,
+        start: Array,
+        goal: Array,
+        space: FieldSpace,
+        *,
+        rng: np.random.Generator,
+        iterations: int,
+        known_path: Array | None = None,
+    ) -> Plan:
+        """Shortest way found with at most `iterations` samples (rounded up to whole chunks).
+
+        `start`, `goal` (3,) odom; both must be free. `known_path` (N, 3), say the rest of the
+        old path, need not be valid or fit the ends. With more iterations and the same `rng`
+        state the cost never rises.
+        """
+        if not (space.contains(start) and space.contains(goal) and space.free(np.stack([start, goal])).all()):
+            return Plan(path=start[None].copy(), cost_m=math.inf, iterations=0, solved=False)
+        if space.segment_free(start, goal):
+            straight = np.stack([start, goal])
+            return Plan(path=straight, cost_m=length(straight), iterations=0, solved=True)
+        search = _Search(self.config, space, self._scratch(space, iterations), start, goal)
+        if known_path is not None and len(known_path):
+            search.take_known(known_path)
+        done = 0
+        while done < iterations:
+            search.advance(rng)
+            done += self.config.chunk
+        return search.result(done)
+
+    def _scratch(self, space: FieldSpace, iterations: int) -> _Memory:
+        nodes = iterations + self.config.chunk + _SPARE_NODES
+        bucket = self.config.bucket_m / space.resolution_m
+        shape = np.array(space.steps.shape)
+        grid = tuple(int(n) for n in np.ceil(shape / bucket))
+        memory = self._memory
+        if memory is None or memory.nodes.shape[1] < nodes or memory.heads.shape[1:] != grid:
+            memory = self._memory = _Memory.of(nodes, grid)
+        return memory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Memory:
+    """Two trees: [0] RRT* and the start's, [1] the goal's of RRT-Connect."""
+
+    nodes: Array
+    links: NDArray[np.int32]
+    heads: NDArray[np.int32]
+    path: Array
+
+    @classmethod
+    def of(cls, nodes: int, grid: tuple[Any, ...]) -> _Memory:
+        links = np.full((2, nodes, 4), -1, np.int32)
+        heads = np.full((2, *grid), -1, np.int32)
+        return cls(np.zeros((2, nodes, 4)), links, heads, np.zeros((_PATH_POINTS, 3)))
+
+    def plant(self, which: int, roots: Array, bucket: float) -> None:
+        """Empty a tree and give it its roots (K, 3); only the first is found by searches."""
+        self.heads[which].fill(-1)
+        self.nodes[which, : len(roots), :3] = roots
+        self.nodes[which, : len(roots), COST] = NEVER
+        self.links[which, : len(roots)] = -1
+        add(self.nodes[which], self.links[which], self.heads[which], 0, -1, bucket)
+
+
+class _Search:
+    """One run: the tree, the best path so far, and rounds of growing and shortening."""
+
+    def __init__(self, config: RRTStarConfig, space: FieldSpace, memory: _Memory, start: Array, goal: Array) -> None:
+        self._config, self._space, self._memory = config, space, memory
+        self._ends = space.to_cells(np.stack([start, goal]))
+        self._bucket = config.bucket_m / space.resolution_m
+        memory.plant(0, self._ends, self._bucket)
+        self._tree = (memory.nodes[0], memory.links[0], memory.heads[0])
+        self._counts = np.array([2, 0, grow.START])
+        self._best, self._path = np.zeros((_PATH_POINTS, 3)), memory.path
+        self._best_cost = NEVER
+        self._forced = np.zeros((0, 3))
+        self._frame = np.vstack([_axes(self._ends[1] - self._ends[0]), self._ends.mean(axis=0)])
+        self._pair: NDArray[np.int64] | None = None  # node counts of RRT-Connect's trees
+
+    def take_known(self, path: Array) -> None:
+        """Hang the valid beginning of a path into the tree; the rest become first samples."""
+        points = without_repeats(np.vstack([self._ends[:1], self._space.to_cells(path)]))
+        reach = np.vstack([points, self._ends[1:]])
+        chain = self._space.to_odom(reach)
+        valid = 1
+        while valid < len(chain) and self._space.segment_free(chain[valid - 1], chain[valid]):
+            valid += 1
+        if valid == len(chain):
+            self._hang(without_repeats(reach))
+        else:
+            self._hang(points[:valid])
+            self._forced = np.ascontiguousarray(points[valid:])
+        self._keep_if_better()
+
+    def advance(self, rng: np.random.Generator) -> None:
+        """One chunk: towards a first path, or growth; then shortening of the best path."""
+        config = self._config
+        draws = rng.random((config.chunk, grow.DRAWS))
+        attempts = rng.random((config.shortcuts, shortcut.DRAWS))
+        if config.first and self._best_cost >= NEVER and not len(self._forced):
+            self._join(draws)
+        else:
+            rest = (self._counts, self._best, self._frame, draws, self._forced, self._settings())
+            grow.grow(self._space.steps, *self._tree, *rest)
+            self._forced = self._forced[:0]
+            self._keep_if_better()
+        count = int(self._counts[grow.BEST])
+        if count:
+            self._path[:count] = self._best[:count]
+            count = shortcut.shorten(self._space.steps, self._path, count, attempts)
+            self._hang(self._path[:count])
+            self._keep_if_better()
+
+    def result(self, iterations: int) -> Plan:
+        """The best path, or the way towards the goal as far as it goes."""
+        count = int(self._counts[grow.BEST])
+        if count:
+            path = self._space.to_odom(self._best[:count])
+            return Plan(path=path, cost_m=length(path), iterations=iterations, solved=True)
+        count = self._way_to(self._nearest_to_goal())
+        path = self._space.to_odom(self._path[: max(count, 1)])
+        return Plan(path=path, cost_m=math.inf, iterations=iterations, solved=False)
+
+    def _join(self, draws: Array) -> None:
+        """RRT-Connect; its start tree lies in the place of RRT*'s, which is empty until there is a path."""
+        memory = self._memory
+        if self._pair is None:
+            memory.plant(0, self._ends[:1], self._bucket)
+            memory.plant(1, self._ends[1:], self._bucket)
+            self._pair = np.array([1, 1])
+        step = self._config.step_m / self._space.resolution_m
+        trees = (memory.nodes, memory.links, memory.heads)
+        arguments = (self._pair, draws, step, self._bucket, self._path)
+        count = two_trees.connect(self._space.steps, *trees, *arguments)
+        if count:
+            memory.plant(0, self._ends, self._bucket)
+            self._hang(without_repeats(self._path[:count]))
+            self._keep_if_better()
+
+    def _hang(self, path: Array) -> None:
+        grow.add_chain(*self._tree, self._counts, self._bucket, np.ascontiguousarray(path))
+
+    def _keep_if_better(self) -> None:
+        if self._tree[0][grow.GOAL, COST] < self._best_cost - 1e-9 and self._counts[grow.NODES] > 2:
+            count = self._way_to(grow.GOAL)
+            if count:
+                self._best[:count] = self._path[:count]
+                self._counts[grow.BEST] = count
+                self._best_cost = length(self._best[:count])
+
+    def _way_to(self, node: int) -> int:
+        return int(way_to(self._tree[0], self._tree[1], node, self._path))
+
+    def _nearest_to_goal(self) -> int:
+        if self._pair is None:
+            return int(self._counts[grow.NEAREST])
+        reached = self._memory.nodes[0, : self._pair[0], :3]
+        return int(np.argmin(np.linalg.norm(reached - self._ends[1], axis=1)))
+
+    def _settings(self) -> Array:
+        """Numbers for `grow`; the neighbourhood shrinks with log(n)/n (Karaman and Frazzoli 2011)."""
+        config, cell = self._config, self._space.resolution_m
+        n = int(self._counts[grow.NODES])
+        volume = float(self._space.steps.size)
+        if self._best_cost < NEVER:
+            c_min = float(np.linalg.norm(self._ends[1] - self._ends[0]))
+            volume = min(volume, math.pi / 6.0 * self._best_cost * max(self._best_cost**2 - c_min**2, 1.0))
+        gamma = config.radius_factor * 2.0 * (4.0 / 3.0 * volume / (4.0 / 3.0 * math.pi)) ** (1.0 / 3.0)
+        radius = min(gamma * (math.log(n) / n) ** (1.0 / 3.0), config.step_m / cell)
+        settings = np.zeros(6)
+        settings[grow.STEP], settings[grow.RADIUS] = config.step_m / cell, radius
+        settings[grow.GOAL_BIAS], settings[grow.LOCAL_SHARE] = config.goal_bias, config.local_share
+        settings[grow.LOCAL_WIDTH], settings[grow.BUCKET] = config.local_width_m / cell, self._bucket
+        return settings
+
+
+def _axes(way: Array) -> Array:
+    """Rotation (3, 3) whose first column points along `way`."""
+    first = way / max(float(np.linalg.norm(way)), 1e-12)
+    helper = np.eye(3)[int(np.argmin(np.abs(first)))]
+    second = np.cross(first, helper)
+    second /= np.linalg.norm(second)
+    return np.column_stack([first, second, np.cross(first, second)])

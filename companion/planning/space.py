@@ -1,0 +1,189 @@
+"""What the planners know about the world: which points and segments are free, how far obstacles are.
+
+`FieldSpace` answers from a `LocalMap`. A cell is blocked when the distance at its centre is
+below the vehicle's radius or when it lies outside the band above ground. Segments are checked
+by exact voxel traversal (Amanatides and Woo 1987) that jumps where the distance field
+proves that nothing blocked can be met (sphere tracing, Hart 1996): same answer, fewer steps.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.core.messages import Array, Array32, LocalMap
+from companion.planning.grid import WINDOW, build_steps, fill_nearest, sample_field, segment_free
+
+Cells = NDArray[np.int32]
+Unknown = Literal["blocked", "stop_before", "optimistic"]
+
+
+class Space(Protocol):
+    """A bounded part of the world, in odom, m."""
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper corner, (3,) each."""
+        ...
+
+    def free(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (N, 3) the vehicle's centre may be at, (N,)."""
+        ...
+
+    def segment_free(self, a: Array, b: Array) -> bool:
+        """May the vehicle's centre go straight from a to b?"""
+        ...
+
+    def distance(self, points: Array) -> Array:
+        """Distance of the points (N, 3) to the nearest obstacle, m, (N,)."""
+        ...
+
+
+class FieldSpace:
+    """Space of one local map for a sphere of `radius_m`.
+
+    With `unknown="blocked"` a cell that is not known free is an obstacle; otherwise the
+    geometry takes it as free (the speed profile stops before it, unless `optimistic`).
+    Points outside the map are unknown. `agl_m` bounds the height above `ground_z` (X, Y).
+
+    >>> space = FieldSpace(local_map, radius_m=0.85, ground_z=fill_ground(local_map), agl_m=(1.0, 6.0))
+    >>> space.segment_free(np.array([0.0, 0.0, 2.0]), np.array([9.0, 0.0, 2.0]))
+    """
+
+    def __init__(
+        self,
+        local_map: LocalMap,
+        *,
+        radius_m: float,
+        ground_z: Array32 | None = None,
+        agl_m: tuple[float, float] = (-math.inf, math.inf),
+        unknown: Unknown = "stop_before",
+    ) -> None:
+        self.map, self.radius_m, self.unknown = local_map, radius_m, unknown
+        self.origin, self.resolution_m = local_map.origin_odom, local_map.resolution_m
+        self._field = local_map.unknown_distance_m if unknown == "blocked" else local_map.distance_m
+        self._bands = bands = self._bands_of(ground_z, agl_m)
+        self.steps = np.empty(local_map.state.shape, np.uint8)
+        """0: blocked; 1 + n: free, and a jump of n / JUMP_UNIT cells meets nothing blocked."""
+        build_steps(self._field, bands, radius_m, self.resolution_m, self.steps)
+
+    def _bands_of(self, ground_z: Array32 | None, agl_m: tuple[float, float]) -> tuple[Cells, Cells, Cells, Cells]:
+        """Lowest and highest allowed cell of each column, and the tightest of the columns near it."""
+        nx, ny, nz = self.map.state.shape
+        low, high = np.zeros((nx, ny), np.int32), np.full((nx, ny), nz - 1, np.int32)
+        if ground_z is not None:
+            above = (ground_z.astype(np.float64) - self.origin[2]) / self.resolution_m - 0.5
+            low[:] = np.clip(np.ceil(above + agl_m[0] / self.resolution_m), 0, nz)
+            high[:] = np.clip(np.floor(above + agl_m[1] / self.resolution_m), -1, nz - 1)
+        return low, high, _highest_near(low), -_highest_near(-high)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Corners of the local map, m."""
+        return self.origin, self.origin + np.array(self.map.state.shape) * self.resolution_m
+
+    def to_cells(self, points: Array) -> Array:
+        """odom m -> cells from the map's corner (not rounded)."""
+        cells: Array = (np.asarray(points, np.float64) - self.origin) / self.resolution_m
+        return cells
+
+    def to_odom(self, cells: Array) -> Array:
+        """Cells from the map's corner -> odom m."""
+        points: Array = cells * self.resolution_m + self.origin
+        return points
+
+    def free(self, points: Array) -> NDArray[np.bool_]:
+        """Points (N, 3) -> (N,)."""
+        cells = np.floor(self.to_cells(points)).astype(np.int64)
+        inside = np.all((cells >= 0) & (cells < self.map.state.shape), axis=1)
+        answer = np.full(len(cells), self.unknown != "blocked")
+        answer[inside] = self.steps[tuple(cells[inside].T)] > 0
+        return answer
+
+    def segment_free(self, a: Array, b: Array) -> bool:
+        """Exact; the part outside the map counts as unknown."""
+        p, q = self.to_cells(a), self.to_cells(b)
+        part = _clip(p, q, np.array(self.map.state.shape, np.float64))
+        whole_inside = part is not None and part == (0.0, 1.0)
+        if not whole_inside and self.unknown == "blocked":
+            return False
+        if part is None:
+            return True
+        inner_p, inner_q = p + part[0] * (q - p), p + part[1] * (q - p)
+        limit = np.array(self.map.state.shape) - 1e-9
+        return bool(segment_free(self.steps, np.clip(inner_p, 0.0, limit), np.clip(inner_q, 0.0, limit)))
+
+    def path_free(self, path: Array) -> bool:
+        """All segments of a polyline (N, 3)."""
+        return all(self.segment_free(a, b) for a, b in itertools.pairwise(path))
+
+    def distance(self, points: Array) -> Array:
+        """Trilinear distance to the nearest occupied cell (N,), m; truncated as the map's."""
+        values: Array = sample_field(self.map.distance_m, np.ascontiguousarray(self.to_cells(points)))
+        return values
+
+    def nearest_free(self, point: Array, *, within_m: float) -> Array | None:
+        """Centre of the nearest free cell, or the point itself if free; None if there is none."""
+        if bool(self.free(point[None])[0]) and self.contains(point):
+            return point
+        candidates = self.free_cells_near(point, within_m=within_m)
+        return candidates[0] if len(candidates) else None
+
+    def free_cells_near(self, point: Array, *, within_m: float) -> Array:
+        """Centres of free cells (K, 3) within a distance, nearest first."""
+        shape = np.array(self.map.state.shape)
+        low = np.clip(np.floor(self.to_cells(point - within_m)), 0, shape).astype(int)
+        high = np.clip(np.ceil(self.to_cells(point + within_m)), 0, shape).astype(int)
+        box = self.steps[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
+        centers = self.to_odom(np.argwhere(box > 0) + low + 0.5)
+        gap = np.linalg.norm(centers - point, axis=1)
+        order = np.argsort(gap, kind="stable")
+        near: Array = centers[order[gap[order] <= within_m]]
+        return near
+
+    def heights(self, i: int, j: int) -> tuple[float, float]:
+        """Lowest and highest allowed z of column (i, j): cell centres, odom, m; low > high: none."""
+        low, high = (float(band[i, j] + 0.5) * self.resolution_m for band in self._bands[:2])
+        return low + float(self.origin[2]), high + float(self.origin[2])
+
+    def contains(self, point: Array, *, margin_m: float = 0.0) -> bool:
+        """Is the point inside the local map, `margin_m` from its border?"""
+        low, high = self.bounds
+        return bool(np.all(point >= low + margin_m) and np.all(point < high - margin_m))
+
+
+def fill_ground(local_map: LocalMap, *, fallback_z: float = math.nan) -> Array32 | None:
+    """Ground height (X, Y), odom m: seen, else as the nearest seen; None: never seen at all."""
+    ground = local_map.ground_z_odom
+    if np.isnan(ground).all():
+        return None if math.isnan(fallback_z) else np.full(ground.shape, fallback_z, np.float32)
+    filled = ground.copy()
+    fill_nearest(filled, np.empty_like(filled))
+    return filled
+
+
+def _highest_near(cells: Cells) -> Cells:
+    """Maximum (X, Y) over the square of +- WINDOW columns."""
+    for axis in (0, 1):
+        wide = np.pad(cells, [(WINDOW, WINDOW) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+        parts = [np.take(wide, np.arange(n, n + cells.shape[axis]), axis=axis) for n in range(2 * WINDOW + 1)]
+        cells = np.maximum.reduce(parts)
+    return cells
+
+
+def _clip(p: Array, q: Array, shape: Array) -> tuple[float, float] | None:
+    """Part [t0, t1] of the segment p..q inside the box 0..shape; None: it misses the box."""
+    t0, t1 = 0.0, 1.0
+    for k in range(3):
+        way = q[k] - p[k]
+        if abs(way) < 1e-12:
+            if not 0.0 <= p[k] < shape[k]:
+                return None
+            continue
+        enter, leave = sorted(((0.0 - p[k]) / way, (shape[k] - p[k]) / way))
+        t0, t1 = max(t0, enter), min(t1, leave)
+    return (t0, t1) if t0 <= t1 else None
