@@ -132,22 +132,20 @@ def _fold(met, rows, words, blocks, amounts, changed):  # type: ignore[no-untype
             f[w] &= ~(h[w] | done[w])
             any_bit |= f[w] | h[w]
         if any_bit != u64(0):
-            _spread(f, octets[0])
-            _spread(h, octets[1])
+            _spread(f.view(np.uint8), octets[0])
+            _spread(h.view(np.uint8), octets[1])
             cells = log_odds[row]
             changed[m] = _update(cells, octets[0].view(np.uint8), octets[1].view(np.uint8), amounts)
-            _settle(cells.view(np.uint64), u8(amounts[2]), done)
+            _settle(cells.view(np.uint64), u8(amounts[2]), done.view(np.uint8))
         f[:] = u64(0)
         h[:] = u64(0)
 
 
 @njit(cache=True, nogil=True)
-def _spread(words, octets):  # type: ignore[no-untyped-def]
-    """Bit i of the words makes byte i of the octets not zero."""
-    for w in range(WORDS):
-        for b in range(8):
-            byte = (words[w] >> u64(8 * b)) & u64(255)
-            octets[8 * w + b] = (byte * u64(0x0101010101010101)) & u64(0x8040201008040201)
+def _spread(bits, octets):  # type: ignore[no-untyped-def]
+    """Bit i of the bytes makes byte i of the octets not zero."""
+    for n in range(CELLS // 8):
+        octets[n] = (u64(bits[n]) * u64(0x0101010101010101)) & u64(0x8040201008040201)
 
 
 @njit(cache=True, nogil=True)
@@ -170,17 +168,14 @@ def _update(cells, missed, hit, amounts):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _settle(octets, lowest, done):  # type: ignore[no-untyped-def]
-    """Set the bits of the cells that equal `lowest`; eight cells are one octet."""
+def _settle(octets, lowest, bits):  # type: ignore[no-untyped-def]
+    """Set the bits of the cells that equal `lowest`; eight cells are one octet and one byte of bits."""
     low, top, gather = u64(0x7F7F7F7F7F7F7F7F), u64(0x0101010101010101), u64(0x0102040810204080)
     pattern = u64(lowest) * top
-    for w in range(WORDS):
-        word = u64(0)
-        for b in range(8):
-            x = octets[8 * w + b] ^ pattern
-            zero_bytes = (~(((x & low) + low) | x | low)) >> u64(7)  # 1 in each byte that is zero
-            word |= ((zero_bytes * gather) >> u64(56)) << u64(8 * b)
-        done[w] = word
+    for n in range(CELLS // 8):
+        x = octets[n] ^ pattern
+        zero_bytes = (~(((x & low) + low) | x | low)) >> u64(7)  # 1 in each byte that is zero
+        bits[n] = u8((zero_bytes * gather) >> u64(56))
 
 
 @njit(cache=True, nogil=True)
