@@ -125,7 +125,7 @@ class Smoother:
             accel_bias=np.array(self._bias.accelerometer()),
             down=np.array(self._smoother.calculateEstimate().atUnit3(G(0)).unitVector()).ravel(),
             pose_variance=np.diag(self._smoother.marginalCovariance(X(self._node))).copy(),
-            factors=self._smoother.getFactors().size(),
+            factors=self._smoother.getFactors().nrFactors(),
         )
 
 

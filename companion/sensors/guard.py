@@ -35,7 +35,7 @@ class StreamGuard:
         if self._newest_ns is not None:
             step_s = (stamp_ns - self._newest_ns) * 1e-9
             if step_s <= 0:
-                found.append(("order", f"{self.name}: stamp {-step_s:.3f} s behind the one before"))
+                found.append(("order", f"{self.name}: stamp {abs(step_s):.3f} s behind the one before"))
             elif step_s * 1e9 > self._config.gap_periods * self._period_ns:
                 found.append(("gap", f"{self.name}: nothing for {step_s:.3f} s"))
         if bad_share > self._config.bad_share:
