@@ -59,8 +59,9 @@ def position_step(sp, x, acceleration, limits, dt, gains, integral, q_sp, out): 
         _learn_hover_thrust(x, acceleration, dt, out)
     v_sp, a_sp = np.empty(3), np.empty(3)
     _velocity_setpoint(sp, x, climb, gains, v_sp)
-    error = v_sp - x[4:7]
+    error = np.empty(3)
     for i in range(3):
+        error[i] = v_sp[i] - x[4 + i]
         kp, kd = (gains[VP_Z], gains[VD_Z]) if i == 2 else (gains[VP_XY], gains[VD_XY])
         a = 0.0 if math.isnan(error[i]) else kp * error[i] + integral[i] - kd * acceleration[i]
         a_sp[i] = a if math.isnan(sp[6 + i]) else a + sp[6 + i]
@@ -237,18 +238,18 @@ def _rate_setpoint(q, q_sp, yaw_rate, g, rate_sp):  # type: ignore[no-untyped-de
 @njit(cache=True, nogil=True)
 def _mix(torque, thrust, mixer, motors):  # type: ignore[no-untyped-def]
     """Roll and pitch before thrust before yaw: thrust gives way downwards, then yaw is cut."""
+    low, high = 0.0, 0.0
     for i in range(4):
         motors[i] = mixer[i, 0] * torque[0] + mixer[i, 1] * torque[1]
-    spread = max(motors.max() - motors.min(), 1e-9)
-    if spread > 1.0:
-        motors *= 1.0 / spread
-    base = min(thrust, 1.0 - motors.max())
-    if base + motors.min() < 0.0:  # never add thrust; give up roll and pitch instead (no airmode)
-        motors *= base / -motors.min()
+        low, high = min(low, motors[i]), max(high, motors[i])
+    scale = 1.0 / max(high - low, 1.0)
+    base = min(thrust, 1.0 - high * scale)
+    if base + low * scale < 0.0:  # never add thrust; give up roll and pitch instead (no airmode)
+        scale = base / -low
     share = 1.0
     for i in range(4):
         yaw = mixer[i, 2] * torque[2]
-        motors[i] += base
+        motors[i] = base + scale * motors[i]
         room = (1.0 - motors[i]) if yaw > 0 else motors[i]
         if abs(yaw) > max(room, 0.0):
             share = min(share, max(room, 0.0) / abs(yaw))

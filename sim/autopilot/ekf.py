@@ -49,8 +49,8 @@ def imu_step(x, P, ring, work, at, gyro, accel, noise):  # type: ignore[no-untyp
     work[SUM_DT] += dt
     if work[SUM_DT] >= noise[1] - 1e-9:
         _grow_covariance(P, R, work, noise)
-    ring[at, 0:4] = x[0:4]
-    ring[at, 4:10] = x[4:10]
+    for i in range(PAST):
+        ring[at, i] = x[i]
 
 
 @njit(cache=True, nogil=True)
@@ -98,25 +98,33 @@ def _grow_covariance(P, R, work, noise):  # type: ignore[no-untyped-def]
     """P <- F P F' + Q over the time since the last call, with the mean specific force."""
     dt = work[SUM_DT]
     sx, sy, sz = work[SUM_F], work[SUM_F + 1], work[SUM_F + 2]
-    for side in range(2):
-        M = P if side == 0 else P.T
-        for j in range(15):
-            t0, t1, t2 = M[0, j], M[1, j], M[2, j]
-            for i in range(3):  # p first: it needs the old v
-                M[6 + i, j] += dt * M[3 + i, j]
-            M[3, j] -= sy * t2 - sz * t1
-            M[4, j] -= sz * t0 - sx * t2
-            M[5, j] -= sx * t1 - sy * t0
-            for i in range(3):
-                for k in range(3):
-                    M[i, j] -= dt * R[i, k] * M[9 + k, j]
-                    M[3 + i, j] -= dt * R[i, k] * M[12 + k, j]
+    for j in range(15):  # P <- F P; p first, for it needs the old v
+        t0, t1, t2 = P[0, j], P[1, j], P[2, j]
+        for i in range(3):
+            P[6 + i, j] += dt * P[3 + i, j]
+            for k in range(3):
+                P[i, j] -= dt * R[i, k] * P[9 + k, j]
+                P[3 + i, j] -= dt * R[i, k] * P[12 + k, j]
+        P[3, j] -= sy * t2 - sz * t1
+        P[4, j] -= sz * t0 - sx * t2
+        P[5, j] -= sx * t1 - sy * t0
+    for j in range(15):  # P <- P F'
+        t0, t1, t2 = P[j, 0], P[j, 1], P[j, 2]
+        for i in range(3):
+            P[j, 6 + i] += dt * P[j, 3 + i]
+            for k in range(3):
+                P[j, i] -= dt * R[i, k] * P[j, 9 + k]
+                P[j, 3 + i] -= dt * R[i, k] * P[j, 12 + k]
+        P[j, 3] -= sy * t2 - sz * t1
+        P[j, 4] -= sz * t0 - sx * t2
+        P[j, 5] -= sx * t1 - sy * t0
     for i in range(3):
         P[i, i] += (noise[3] * dt) ** 2
         P[3 + i, 3 + i] += (noise[4] * dt) ** 2
         P[9 + i, 9 + i] += (noise[5] * dt) ** 2
         P[12 + i, 12 + i] += (noise[6] * dt) ** 2
-    work[SUM_DT : SUM_F + 3] = 0.0
+    for i in range(SUM_DT, SUM_F + 3):
+        work[i] = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -132,9 +140,8 @@ def past_state(ring, stamps, stamp_ns, out):  # type: ignore[no-untyped-def]
             best = k
     best = max(best, 0) if best >= 0 else oldest
     ahead = min(max((stamp_ns - stamps[best]) * 1e-9, 0.0), 0.02)
-    out[:] = ring[best]
-    for i in range(3):
-        out[7 + i] += ahead * out[4 + i]
+    for i in range(PAST):
+        out[i] = ring[best, i] + (ahead * ring[best, i - 3] if i >= 7 else 0.0)
     if stamp_ns < stamps[oldest]:
         return stamps[oldest] - stamp_ns
     return max(0, stamp_ns - stamps[newest] - 20_000_000)
@@ -153,25 +160,20 @@ def _fuse_row(x, P, past, h, innovation, variance, gate, total):  # type: ignore
     ratio = innovation * innovation / (gate * gate * S) if gate > 0.0 else 0.0
     if not ratio < 1.0:
         return ratio
-    dx = Ph * (innovation / S)
+    dx = np.empty(15)
     for i in range(15):
+        dx[i] = Ph[i] * innovation / S
+        total[i] += dx[i]
         for k in range(15):
             P[i, k] -= Ph[i] * Ph[k] / S
-    for i in range(15):
         P[i, i] = max(P[i, i], 1e-12)
-    _apply(x, dx)
-    _turn_world(past, dx)
-    for i in range(6):
-        past[4 + i] += dx[3 + i]
-    total += dx
-    return ratio
-
-
-@njit(cache=True, nogil=True)
-def _apply(x, dx):  # type: ignore[no-untyped-def]
     _turn_world(x, dx)
     for i in range(12):
         x[4 + i] += dx[3 + i]
+    _turn_world(past, dx)
+    for i in range(6):
+        past[4 + i] += dx[3 + i]
+    return ratio
 
 
 @njit(cache=True, nogil=True)
@@ -204,12 +206,12 @@ def fuse_pose(x, P, ring, past, z, variance, gates, ratios):  # type: ignore[no-
 
     `past` is the state at its stamp; `ratios` receives each row's innovation test.
     """
-    total, h = np.zeros(15), np.zeros(15)
+    total = np.zeros(15)
     for row in range(ROWS):
         ratios[row] = math.nan
         if not math.isfinite(z[row]):
             continue
-        h[:] = 0.0
+        h = np.zeros(15)
         if row < 3:
             h[6 + row] = 1.0
             innovation = z[row] - past[7 + row]
@@ -227,13 +229,12 @@ def fuse_pose(x, P, ring, past, z, variance, gates, ratios):  # type: ignore[no-
 @njit(cache=True, nogil=True)
 def fuse_gravity(x, P, ring, force, sigma):  # type: ignore[no-untyped-def]
     """The specific force points up on average: holds roll and pitch while nothing else does."""
-    total, h, unused = np.zeros(15), np.zeros(15), np.zeros(PAST)
+    total, unused = np.zeros(15), np.zeros(PAST)
     R = rotation_of(x)
     for row in range(2):
-        h[:] = 0.0
+        h = np.zeros(15)
         h[1 - row] = -GRAVITY if row == 0 else GRAVITY  # d(R f) = theta x (0, 0, -g)
         level = R[row, 0] * force[0] + R[row, 1] * force[1] + R[row, 2] * force[2]
-        unused[0] = 1.0
         _fuse_row(x, P, unused, h, -level, sigma * sigma, 0.0, total)
     _correct_ring(ring, total)
 
@@ -256,6 +257,7 @@ def reset_row(x, P, ring, past, row, value, variance):  # type: ignore[no-untype
         _turn_world(past, turn)
         for i in range(RING):
             _turn_world(ring[i], turn)
-    P[error, :] = 0.0
-    P[:, error] = 0.0
+    for i in range(15):
+        P[error, i] = 0.0
+        P[i, error] = 0.0
     P[error, error] = variance
