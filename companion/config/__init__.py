@@ -20,7 +20,7 @@ from companion.mapping.node import MappingConfig
 from companion.mission.config import MissionConfig
 from companion.planning.config import PlanningConfig
 from companion.safety.assess import SafetyConfig
-from companion.tracking.config import TrackingConfig
+from companion.tracking.node import TrackingConfig
 
 DELAY_MS: dict[str, dict[str, float]] = {
     # p95 of the compute time on a 2-core machine, rounded up; see docs/performance.md.
