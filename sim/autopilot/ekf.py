@@ -20,8 +20,8 @@ PAST = 10  # q, v, p of a past state
 ROWS = 7  # of an external pose: p_ned, v_ned, yaw
 
 # Places in `work`: what the kernels carry from sample to sample.
-SUM_DT, SUM_F, LP_ACC, OMEGA, FORCE = 0, 1, 4, 7, 10
-WORK = 13
+SUM_DT, SUM_F, LP_ACC, OMEGA, FORCE, SHAKE = 0, 1, 4, 7, 10, 13
+WORK = 16
 
 
 @njit(cache=True, nogil=True)
@@ -35,7 +35,9 @@ def imu_step(x, P, ring, work, at, gyro, accel, noise):  # type: ignore[no-untyp
     wx, wy, wz = gyro[0] - x[10], -gyro[1] - x[11], -gyro[2] - x[12]
     fx, fy, fz = accel[0] - x[13], -accel[1] - x[14], -accel[2] - x[15]
     work[OMEGA], work[OMEGA + 1], work[OMEGA + 2] = wx, wy, wz
-    work[FORCE], work[FORCE + 1], work[FORCE + 2] = fx, fy, fz
+    for i, f in enumerate((fx, fy, fz)):
+        work[SHAKE + i] += 0.01 * (abs(f - work[FORCE + i]) - work[SHAKE + i])
+        work[FORCE + i] = f
     _turn(x, 0.5 * dt * wx, 0.5 * dt * wy, 0.5 * dt * wz)  # attitude at mid-interval
     R = rotation_of(x)
     _turn(x, 0.5 * dt * wx, 0.5 * dt * wy, 0.5 * dt * wz)

@@ -13,7 +13,7 @@ import numpy as np
 
 from companion.core.messages import Array
 from sim.autopilot import ekf
-from sim.autopilot.frames import quaternion_from_euler
+from sim.autopilot.frames import quaternion_from_euler, turn_about_down
 from sim.autopilot.params import Parameters
 from sim.autopilot.readings import ExternalPose, GpsFix
 
@@ -85,6 +85,11 @@ class Estimator:
     def force(self) -> Array:
         """Specific force FRD, bias removed, m/s2, (3,)."""
         return self._work[ekf.FORCE : ekf.FORCE + 3]
+
+    @property
+    def vibration(self) -> Array:
+        """Mean change of the specific force from sample to sample, m/s2, (3,): PX4's measure."""
+        return self._work[ekf.SHAKE : ekf.SHAKE + 3]
 
     @property
     def xy_valid(self) -> bool:
@@ -180,7 +185,7 @@ class Estimator:
         p, v, yaw = pose.p, pose.v, pose.yaw
         own_yaw = ekf.yaw_of(self._past)
         if not control & YAW and not pose.aligned_with_north and math.isfinite(yaw):
-            turn = _turn_z(own_yaw - yaw)  # the companion's frame stands askew to ours
+            turn = turn_about_down(own_yaw - yaw)  # the companion's frame stands askew to ours
             p, v = turn @ p, (v if pose.v_in_body else turn @ v)
         if pose.v_in_body:
             v = ekf.rotation_of(self._past) @ v
@@ -295,8 +300,3 @@ class Estimator:
         flags |= (2 | 8 | 16 | 256 | 512) if self.xy_valid else 128
         flags |= (4 | 32) if self.z_valid else 0
         return flags | (64 if math.isfinite(self.range_m) else 0)
-
-
-def _turn_z(angle: float) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

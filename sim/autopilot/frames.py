@@ -66,3 +66,9 @@ def local(origin: tuple[float, float, float], latitude: float, longitude: float,
             origin[2] - altitude,
         ]
     )
+
+
+def turn_about_down(angle: float) -> Array:
+    """Rotation matrix (3, 3) about NED's z axis; positive turns north to east."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

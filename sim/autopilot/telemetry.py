@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from companion.core.messages import Array
 from sim.autopilot.codec import BY_NAME, Encoder
 from sim.autopilot.commander import Commander
 from sim.autopilot.control import Controller
@@ -34,6 +33,7 @@ RATES_HZ: Final[dict[str, float]] = {
     "CURRENT_MODE": 0.5,
 }  # fmt: skip
 GYRO, ACCEL, BARO, GPS, BATTERY, PREARM, VISION = 1, 2, 8, 32, 1 << 25, 1 << 28, 128  # MAV_SYS_STATUS_SENSOR
+IMU_FIELDS: Final = 0x3F | 1 << 9 | 1 << 11  # HIGHRES_IMU: accel, gyro, pressure and its altitude
 NAN: Final = math.nan
 
 
@@ -43,8 +43,6 @@ class Readings:
 
     battery_v: float = NAN
     gps: GpsFix | None = None
-    temperature_c: float = 25.0
-    vibration: Array = field(default_factory=lambda: np.zeros(3))  # mean change of acceleration, m/s2
 
 
 @dataclass(slots=True)
@@ -108,7 +106,7 @@ class Telemetry:
         altitude = e.baro_altitude if math.isfinite(e.baro_altitude) else 0.0
         return self._encoder(
             self._layouts["HIGHRES_IMU"], self._clock.us, *e.force.tolist(), *e.omega.tolist(), 0.0, 0.0, 0.0,
-            _pressure_hpa(altitude), 0.0, altitude, self._readings.temperature_c, 63 | 0x1A00, 0,
+            _pressure_hpa(altitude), 0.0, altitude, 0.0, IMU_FIELDS, 0,
         )  # fmt: skip
 
     def _local_position_ned(self) -> bytes:
@@ -281,14 +279,14 @@ class Telemetry:
         altitude = self._estimator.baro_altitude
         if not math.isfinite(altitude):
             return b""
-        celsius = round(100 * self._readings.temperature_c)
+        celsius = round(100 * (15.0 - 0.0065 * altitude))  # of the standard atmosphere
         return self._encoder(self._layouts["SCALED_PRESSURE"], self._clock.ms, _pressure_hpa(altitude), 0.0, celsius, 0)
 
     def _system_time(self) -> bytes:
         return self._encoder(self._layouts["SYSTEM_TIME"], 0, self._clock.ms)
 
     def _vibration(self) -> bytes:
-        return self._encoder(self._layouts["VIBRATION"], self._clock.us, *self._readings.vibration, 0, 0, 0)
+        return self._encoder(self._layouts["VIBRATION"], self._clock.us, *self._estimator.vibration, 0, 0, 0)
 
 
 def _pressure_hpa(altitude_m: float) -> float:

@@ -146,6 +146,9 @@ def test_telemetry_tells_the_truth_within_the_estimator(bench):
     assert 2 * math.atan2(quaternion.q4, quaternion.q1) == pytest.approx(0.7, abs=0.05)
     assert b.of("HIGHRES_IMU")[-1].zacc == pytest.approx(-9.8, abs=1.5)
     assert abs(local.time_boot_ms - b.own_ns // 1_000_000) < 50  # autopilot time, not the companion's
+    shaken = b.of("VIBRATION")[-1]
+    assert 0.1 < shaken.vibration_z < 10.0  # rotors turn
+    assert b.of("VIBRATION")[0].vibration_z < 0.1
     target = b.of("POSITION_TARGET_LOCAL_NED")[-1]
     assert (target.x, target.y, target.z) == (1.0, 2.0, -4.0)
     assert target.type_mask == 0b111111000 | 1 << 11
