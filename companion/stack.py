@@ -24,6 +24,6 @@ def build(config: Config, mission: Mission, *, seed: int) -> list[Node]:
         PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),
         TrackingNode(config.tracking),
         MissionNode(mission, config.mission),
-        SafetyNode(config.safety),
+        SafetyNode(config.safety, fence=mission.fence),
         AutopilotNode(config.autopilot),
     ]

@@ -18,7 +18,7 @@ from companion.config import Config, apply_overrides, load_config
 from companion.core.errors import InputError
 from companion.mission.model import Mission, parse_mission
 from companion.report.tracks import Tracks
-from companion.runtime.flight import Flight, LockstepConfig
+from companion.runtime.flight import Flight
 from companion.runtime.flight import Progress as Where
 from companion.runtime.flight_log import FlightLog
 from companion.stack import build
@@ -85,9 +85,7 @@ def fly_request(request: Request, console: Console) -> Outcome:
     """Fly it, write everything into `request.out`, return what came out."""
     request.out.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    with simulation.open_simulator(
-        request.world, request.seed, request.overrides, request.workers, console
-    ) as sim:
+    with simulation.open_simulator(request.world, request.seed, request.overrides, request.workers, console) as sim:
         tracks, log = Tracks(), FlightLog(request.out / "flight.log", store_all=request.log_all)
         stack = build(request.config, request.mission, seed=request.seed)
         flight = Flight([sim.node, *stack], request.config.lockstep, log=log, listeners=[tracks])
@@ -139,6 +137,3 @@ def _read(file: Path) -> str:
         raise InputError(
             f"cannot be read: {error.__class__.__name__}", file=str(file), valid="a YAML text file"
         ) from error
-
-
-__all__ = ["LockstepConfig", "Request", "fly", "fly_request"]

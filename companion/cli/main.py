@@ -29,7 +29,7 @@ def _group(name: str, help_text: str, **commands: object) -> None:
     app.add_typer(group, name=name)
 
 
-_group("mission", "Check mission files.", check=mission.check)
+_group("mission", "Check mission files.", check=mission.check, table=mission.table)
 _group("config", "Show the configuration.", dump=config.dump)
 _group("mavlink", "Look into MAVLink logs.", inspect=mavlink.inspect)
 

@@ -56,8 +56,7 @@ def _print(report: LogReport, file: Path) -> None:
     console.print(table)
     start = datetime.fromtimestamp(report.first_us / 1e6, UTC)
     console.print(
-        f"\n{file.name}: {report.messages:,} messages in {report.duration_s:.1f} s "
-        f"from {start:%Y-%m-%d %H:%M:%S} UTC",
+        f"\n{file.name}: {report.messages:,} messages in {report.duration_s:.1f} s from {start:%Y-%m-%d %H:%M:%S} UTC",
         highlight=False,
     )
     console.print(
@@ -69,9 +68,7 @@ def _print(report: LogReport, file: Path) -> None:
 
 
 def _print_damage(report: LogReport, console: Console) -> None:
-    console.print(
-        f"{report.corrupt_pieces:,} corrupt pieces skipped ({report.corrupt_bytes:,} bytes)", highlight=False
-    )
+    console.print(f"{report.corrupt_pieces:,} corrupt pieces skipped ({report.corrupt_bytes:,} bytes)", highlight=False)
     if report.cut_off_bytes:
         console.print(f"the last record is cut off ({report.cut_off_bytes} bytes)", highlight=False)
     for what, count in report.foreign.items():

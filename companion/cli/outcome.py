@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
@@ -34,6 +34,7 @@ class Outcome:
     summary: Summary
     out: Path
     picture: Path
+    tracks: Tracks
 
 
 def write_outcome(
@@ -50,12 +51,13 @@ def write_outcome(
     summary = _summary(request, flight, tracks, log, sim, wall_s)
     (out / "summary.json").write_bytes(to_json(summary))
     shutil.copyfile(request.mission_file, out / "mission.yaml")
-    (out / "config.yaml").write_text(dump_config(request.config) + sim.describe(), encoding="utf-8")
+    (out / "config.yaml").write_text(dump_config(request.config), encoding="utf-8")
+    (out / "simulator.yaml").write_text(sim.describe(), encoding="utf-8")
     _write_why(out / "why.log", tracks)
     _write_map(out / "map.npz", stack)
     picture = out / "flight.png"
     draw_flight(picture, tracks, sim.scenery(), summary)
-    return Outcome(summary, out, picture)
+    return Outcome(summary, out, picture, tracks)
 
 
 def _summary(
@@ -90,7 +92,8 @@ def _write_why(path: Path, tracks: Tracks) -> None:
 def _write_map(path: Path, stack: Sequence[Node]) -> None:
     for node in stack:
         if isinstance(node, MappingNode):
-            np.savez_compressed(path, **node.map.to_arrays())
+            arrays: dict[str, Any] = {**node.voxels.to_arrays()}
+            np.savez_compressed(path, **arrays)
 
 
 def print_outcome(outcome: Outcome, console: Console, *, as_json: bool) -> None:

@@ -45,8 +45,8 @@ class Simulator:
         return {"SimNode": node_cpu_s, **self.renderer.cpu_s}
 
     def describe(self) -> str:
-        """The simulator's configuration as a YAML document of its own."""
-        return "---\n" + dump_struct(self.config, root="sim")
+        """The simulator's configuration as YAML."""
+        return dump_struct(self.config, root="sim")
 
 
 @contextmanager
@@ -54,9 +54,7 @@ def open_simulator(
     world: str, seed: int, overrides: Sequence[str], workers: int, console: Console
 ) -> Iterator[Simulator]:
     """Build world and renderer, warm both up, and close what was opened."""
-    config = apply_overrides_to(
-        SimConfig(), [o.removeprefix("sim.") for o in overrides if o.startswith("sim.")]
-    )
+    config = apply_overrides_to(SimConfig(), [o.removeprefix("sim.") for o in overrides if o.startswith("sim.")])
     with console.status(f"building world {world}, seed {seed}"):
         built = load_world(world, seed=seed)
     with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):

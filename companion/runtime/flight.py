@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import msgspec
-
+from companion.config import LockstepConfig
 from companion.core import topics
 from companion.core.messages import GroundTruth, MissionStatus
 from companion.core.node import Node, Topic
@@ -15,20 +14,6 @@ from companion.runtime.flight_log import FlightLog
 from companion.runtime.lockstep import Lockstep
 
 STEP_NS = 100_000_000
-DELAY_MS: dict[str, dict[str, float]] = {
-    # p95 of the compute time on a 2-core machine, rounded up; see docs/performance.md.
-    "LioNode": {"sensors/lidar": 15.0, "sensors/camera": 3.0},
-    "GraphNode": {"estimation/likelihood": 8.0},
-    "MappingNode": {"estimation/registered_scan": 25.0},
-    "PlanningNode": {"mapping/local_map": 20.0, "mission/goal": 20.0},
-}
-
-
-class LockstepConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How simulated time is run."""
-
-    delay_ms: dict[str, dict[str, float]] = msgspec.field(default_factory=lambda: dict(DELAY_MS))
-    """Modelled compute time: node -> topic or timer -> ms until its outputs are visible."""
 
 
 class Listener(Protocol):

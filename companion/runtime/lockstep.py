@@ -53,9 +53,7 @@ class _Seat:
 class Lockstep:
     """Runs nodes; `delays_ns` maps node name -> {topic or timer name -> modelled compute time}."""
 
-    def __init__(
-        self, nodes: Sequence[Node], *, delays_ns: Mapping[str, Mapping[str, int]], tap: Tap
-    ) -> None:
+    def __init__(self, nodes: Sequence[Node], *, delays_ns: Mapping[str, Mapping[str, int]], tap: Tap) -> None:
         self.now_ns = 0
         self._tap = tap
         self._sequence = 0
