@@ -6,6 +6,7 @@ to a least clearance.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -56,6 +57,25 @@ class Route:
     space: FieldSpace  # that it was planned in
 
 
+class Spaces:
+    """One map for several radii, widest first; the narrower are built when they are asked for."""
+
+    def __init__(self, widest: FieldSpace, radii_m: list[float]) -> None:
+        self._built, self._radii_m = [widest], radii_m
+
+    @property
+    def widest(self) -> FieldSpace:
+        """With all the clearance asked for."""
+        return self._built[0]
+
+    def __iter__(self) -> Iterator[FieldSpace]:
+        yield self._built[0]
+        for n, radius_m in enumerate(self._radii_m, start=1):
+            if len(self._built) == n:
+                self._built.append(self._built[0].with_radius(radius_m))
+            yield self._built[n]
+
+
 class RouteFinder:
     """Owns a planner; an answer depends on the arguments alone."""
 
@@ -75,17 +95,15 @@ class RouteFinder:
         """The narrowest planning radius."""
         return min(self.radii_m(limits))
 
-    def spaces(self, local_map: LocalMap, ground_z: Array32 | None, limits: Limits) -> list[FieldSpace]:
+    def spaces(self, local_map: LocalMap, ground_z: Array32 | None, limits: Limits) -> Spaces:
         """The same map with shrinking clearance."""
-        agl_m = (limits.agl_min, limits.agl_max)
-        return [
-            FieldSpace(local_map, radius_m=r, ground_z=ground_z, agl_m=agl_m, unknown=limits.unknown)
-            for r in self.radii_m(limits)
-        ]
+        agl_m, radii = (limits.agl_min, limits.agl_max), self.radii_m(limits)
+        widest = FieldSpace(local_map, radius_m=radii[0], ground_z=ground_z, agl_m=agl_m, unknown=limits.unknown)
+        return Spaces(widest, radii[1:])
 
     def find(
         self,
-        spaces: list[FieldSpace],
+        spaces: Spaces,
         start: Array,
         goal: Array,
         *,

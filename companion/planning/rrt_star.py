@@ -97,7 +97,7 @@ class RRTStar:
     def _scratch(self, space: FieldSpace, iterations: int) -> _Memory:
         nodes = iterations + self.config.chunk + _SPARE_NODES
         bucket = self.config.bucket_m / space.resolution_m
-        shape = np.array(space.steps.shape)
+        shape: NDArray[np.int64] = np.array(space.steps.shape)
         grid = tuple(int(n) for n in np.ceil(shape / bucket))
         memory = self._memory
         if memory is None or memory.nodes.shape[1] < nodes or memory.heads.shape[1:] != grid:

@@ -8,6 +8,7 @@ proves that nothing blocked can be met (sphere tracing, Hart 1996): same answer,
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from typing import Literal, Protocol
@@ -66,10 +67,21 @@ class FieldSpace:
         self.map, self.radius_m, self.unknown = local_map, radius_m, unknown
         self.origin, self.resolution_m = local_map.origin_odom, local_map.resolution_m
         self._field = local_map.unknown_distance_m if unknown == "blocked" else local_map.distance_m
-        self._bands = bands = self._bands_of(ground_z, agl_m)
-        self.steps = np.empty(local_map.state.shape, np.uint8)
+        self._bands = self._bands_of(ground_z, agl_m)
+        self.steps = self._built()
         """0: blocked; 1 + n: free, and a jump of n / JUMP_UNIT cells meets nothing blocked."""
-        build_steps(self._field, bands, radius_m, self.resolution_m, self.steps)
+
+    def with_radius(self, radius_m: float) -> FieldSpace:
+        """The same space for a sphere of another radius."""
+        other = copy.copy(self)
+        other.radius_m = radius_m
+        other.steps = other._built()
+        return other
+
+    def _built(self) -> NDArray[np.uint8]:
+        steps = np.empty(self.map.state.shape, np.uint8)
+        build_steps(self._field, self._bands, self.radius_m, self.resolution_m, steps)
+        return steps
 
     def _bands_of(self, ground_z: Array32 | None, agl_m: tuple[float, float]) -> tuple[Cells, Cells, Cells, Cells]:
         """Lowest and highest allowed cell of each column, and the tightest of the columns near it."""

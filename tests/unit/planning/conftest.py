@@ -1,5 +1,8 @@
 """Worlds for the planners: local maps made from exact occupancy."""
 
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
@@ -60,3 +63,12 @@ def local_map():
 @pytest.fixture(scope="session")
 def forest():
     return _forest
+
+
+@pytest.fixture(scope="session")
+def flights():
+    path = Path(__file__).with_name("flights.py")
+    spec = importlib.util.spec_from_file_location("planning_flights", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

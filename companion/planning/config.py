@@ -1,0 +1,46 @@
+"""Settings of the planning stage."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from companion.planning.route import RouteConfig
+from companion.planning.rrt_star import RRTStarConfig
+from companion.planning.smooth import SmoothConfig
+from companion.planning.speed_profile import SpeedConfig
+
+Metres = Annotated[float, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Replanning and its algorithms."""
+
+    route: RouteConfig = RouteConfig()
+    rrt_star: RRTStarConfig = RRTStarConfig()
+    smooth: SmoothConfig = SmoothConfig()
+    speed: SpeedConfig = SpeedConfig()
+    commit_s: Annotated[float, msgspec.Meta(ge=0)] = 0.15
+    """Flown before a new plan takes over: its latency and 0.1 s."""
+    keep_slack_m: Metres = 0.1
+    """The old route stays while it is at most this much nearer to obstacles than it was planned."""
+    switch_share: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.9
+    """A new route replaces a good old one if it is shorter than this share of it ..."""
+    switch_m: Metres = 0.3
+    """... less this."""
+    ahead_m: Metres = 6.0
+    """Planned beyond a goal that is flown through."""
+    ground_within_m: Metres = 1.5
+    """Ground seen this near to a goal gives its height."""
+    blocked_after: Count = 5
+    """Failed replans in a row until the plan is `blocked`."""
+    creep_after: Count = 5
+    """Replans without moving, although there is a route, until known space is asked for the hull alone."""
+    stuck_after: Count = 40
+    """Replans without moving until the plan is `blocked`."""
+    creep_speed_m_s: Annotated[float, msgspec.Meta(gt=0)] = 0.5
+    """Speed then."""
+    creep_margin_m: Metres = 0.05
+    """Known space beyond the hull then."""

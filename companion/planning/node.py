@@ -1,0 +1,125 @@
+"""Planning: at each local map and each goal a trajectory, ten times a second whether it is reached."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.core import topics
+from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, Trajectory
+from companion.core.node import Node, Outputs, every, on
+from companion.planning.config import PlanningConfig
+from companion.planning.flown import Flown
+from companion.planning.polyline import at, cut, length, project
+from companion.planning.replanner import Replanner, Situation
+from companion.planning.space import fill_ground
+from companion.planning.target import ground_below
+from companion.planning.warm_up import warm_up
+
+_LOOK_M = 2.0  # a trajectory that ends sooner looks at the route this far ahead
+_STATUS_SPACING = 5  # every so manieth point of the route is shown
+
+
+class PlanningNode(Node):
+    """Holds the newest inputs; `Replanner` decides."""
+
+    publishes = (topics.TRAJECTORY, topics.PLAN)
+
+    def __init__(self, config: PlanningConfig, *, hull_radius_m: float, seed: int) -> None:
+        self.config = config
+        self._replanner = Replanner(config, hull_radius_m=hull_radius_m, seed=seed)
+        self._odometry: Odometry | None = None
+        self._map: LocalMap | None = None
+        self._ground: Array32 | None = None
+        self._ground_z = math.nan  # last seen under the vehicle
+        warm_up(config, hull_radius_m=hull_radius_m)
+
+    @on(topics.ODOMETRY)
+    def take_odometry(self, message: Odometry) -> None:
+        """The newest state."""
+        self._odometry = message
+
+    @on(topics.GOAL)
+    def take_goal(self, message: Goal) -> Outputs:
+        """A new goal is planned for at once."""
+        self._replanner.take_goal(message)
+        yield from self._replan()
+
+    @on(topics.LOCAL_MAP)
+    def take_map(self, message: LocalMap) -> Outputs:
+        """A new map: replan."""
+        self._map = message
+        if self._odometry is not None:
+            within = self.config.ground_within_m
+            p = self._odometry.p_odom
+            self._ground_z = ground_below(message, p, within_m=within, fallback_z=self._ground_z)
+        self._ground = fill_ground(message, fallback_z=self._ground_z)
+        yield from self._replan()
+
+    @every(hz=10)
+    def watch(self, now_ns: int) -> Outputs:
+        """Is the goal reached? Says so between replans."""
+        if self._odometry is not None:
+            self._replanner.look(self._odometry.p_odom, self._odometry.v_odom)
+        yield topics.PLAN(self._status(now_ns))
+
+    def _replan(self) -> Outputs:
+        goal, odometry, local_map = self._replanner.goal, self._odometry, self._map
+        if goal is None or odometry is None or local_map is None:
+            return
+        now = Situation(
+            p_odom=odometry.p_odom,
+            v_odom=odometry.v_odom,
+            local_map=local_map,
+            ground=self._ground,
+            ground_z=self._ground_z,
+        )
+        flown = self._replanner.update(now)
+        yield topics.TRAJECTORY(self._trajectory(odometry, goal, flown))
+        yield topics.PLAN(self._status(odometry.stamp_ns))
+
+    def _trajectory(self, odometry: Odometry, goal: Goal, flown: Flown) -> Trajectory:
+        points, speeds = flown.ahead_until_stop
+        return Trajectory(
+            stamp_ns=odometry.stamp_ns,
+            goal_id=goal.id,
+            p_odom=points.copy(),
+            speed=speeds,
+            accel_limit=goal.limits.accel,
+            yaw=_look(flown, odometry, goal),
+            yaw_rate_limit=goal.limits.yaw_rate,
+        )
+
+    def _status(self, now_ns: int) -> PlanStatus:
+        replanner, odometry = self._replanner, self._odometry
+        goal, flown = replanner.goal, replanner.flown
+        ahead, distance_m = np.empty((0, 3)), math.nan
+        if flown is not None and odometry is not None and len(flown.points) > 1:
+            s, _ = project(flown.points, odometry.p_odom)
+            ahead = cut(flown.points, s, length(flown.points))[::_STATUS_SPACING]
+            distance_m = max(flown.reach_m - s, 0.0)
+        return PlanStatus(
+            stamp_ns=now_ns,
+            goal_id=goal.id if goal is not None else -1,
+            state=replanner.state,
+            distance_m=distance_m,
+            plan_p_odom=ahead,
+            cost_m=flown.reach_m if flown is not None else math.nan,
+            iterations=replanner.iterations,
+        )
+
+
+def _look(flown: Flown, odometry: Odometry, goal: Goal) -> float:
+    """Heading asked for; NaN: along the path.
+
+    When the trajectory ends soon (unknown space ahead), along the route: looking there is what
+    makes it known.
+    """
+    if not math.isnan(goal.yaw) or goal.kind != "fly" or len(flown.points) < 2:
+        return goal.yaw
+    s, _ = project(flown.points, odometry.p_odom)
+    if length(flown.ahead_until_stop[0]) - s > 1.0:
+        return math.nan
+    way = at(flown.points, np.array([s + _LOOK_M]))[0] - odometry.p_odom
+    return math.atan2(way[1], way[0]) if math.hypot(way[0], way[1]) > 0.4 else math.nan

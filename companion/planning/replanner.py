@@ -1,0 +1,273 @@
+"""Decides at each new map what to fly: keep the old way, take a new one, brake, escape, stop.
+
+Always ends: failures are counted, and after a few the plan is `blocked` until a map brings a way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from companion.core.messages import Array, Array32, Goal, LocalMap
+from companion.planning.config import PlanningConfig
+from companion.planning.flown import SLOW_M_S, Commitment, Flown, braked, clear_m, commit, with_speeds
+from companion.planning.polyline import cut, length, project, resample, without_repeats
+from companion.planning.route import Route, RouteFinder, Spaces
+from companion.planning.smooth import smooth
+from companion.planning.space import FieldSpace
+from companion.planning.target import at_height
+
+State = Literal["idle", "flying", "reached", "blocked"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Situation:
+    """Where the vehicle is and what is known around it."""
+
+    p_odom: Array
+    v_odom: Array
+    local_map: LocalMap
+    ground: Array32 | None  # filled, (X, Y)
+    ground_z: float  # last seen under the vehicle
+
+
+class Replanner:
+    """Feed it goals and situations; `flown` is what to fly."""
+
+    def __init__(self, config: PlanningConfig, *, hull_radius_m: float, seed: int) -> None:
+        self.config, self.hull_radius_m, self._seed = config, hull_radius_m, seed
+        self._finder = RouteFinder(config.route, config.rrt_star, hull_radius_m=hull_radius_m)
+        self.flown: Flown | None = None
+        self.goal: Goal | None = None
+        self.reached = False
+        self.iterations = self._fails = self._still = self._replans = 0
+        self._target: Array | None = None  # where the route leads; None: none yet
+        self._goal_odom = np.zeros(3)  # the goal with its height from the ground
+        self._planned_radius_m = hull_radius_m
+        self._at_border = self._substitute = False
+        self._begun = False  # the present goal was planned for
+
+    def take_goal(self, goal: Goal) -> None:
+        """A new goal; the way being flown stays until the next `update`."""
+        self.goal, self.reached, self._begun = goal, False, False
+        self._fails = self._still = 0
+        self._target = None
+
+    @property
+    def state(self) -> State:
+        """For PLAN."""
+        if self.goal is None:
+            return "idle"
+        if self.reached:
+            return "reached"
+        blocked = self._fails >= self.config.blocked_after or self._still >= self.config.stuck_after
+        return "blocked" if blocked else "flying"
+
+    def look(self, p_odom: Array, v_odom: Array) -> None:
+        """Notice whether the goal is reached."""
+        if self.goal is None or self._target is None or self.flown is None or self.reached:
+            return
+        if self.goal.kind == "hold":
+            self.reached = float(np.linalg.norm(v_odom)) < SLOW_M_S
+            return
+        to_target = float(np.linalg.norm(p_odom - self._target))
+        to_goal = float(np.linalg.norm(p_odom - self._goal_odom))
+        if self._at_border:
+            self.reached = to_goal <= self.goal.radius_m
+        elif self._substitute:
+            self.reached = to_goal <= self.goal.radius_m or to_target <= min(self.goal.radius_m, 0.3)
+        else:
+            self.reached = to_target <= self.goal.radius_m or self._passed(p_odom)
+
+    def _passed(self, p_odom: Array) -> bool:
+        """Flown through: the vehicle is beyond the goal on its way."""
+        if self.goal is None or self.flown is None or not self.goal.fly_through:
+            return False
+        s, off = project(self.flown.points, p_odom)
+        return off < self.goal.radius_m and s > self.flown.reach_m + 0.05 < length(self.flown.points)
+
+    def update(self, now: Situation) -> Flown:
+        """Replan; the answer is also kept as `flown`."""
+        assert self.goal is not None
+        self._replans += 1
+        if self._begun:
+            self.look(now.p_odom, now.v_odom)
+        had = self.flown
+        fly = {"takeoff": self._take_off, "fly": self._fly, "hold": self._hold}[self.goal.kind]
+        self.flown = fly(self.goal, now)
+        self._begun = True
+        self._count_standing(now, had)
+        return self.flown
+
+    # --- kinds of goals ----------------------------------------------------------------
+
+    def _take_off(self, goal: Goal, now: Situation) -> Flown:
+        """Straight up; unknown space is allowed, what is seen is not."""
+        if not self._begun or self.flown is None:
+            foot = now.p_odom.copy()
+            self._target = self._goal_odom = np.array([foot[0], foot[1], goal.p_odom[2]])
+            self._at_border = self._substitute = False
+            path = np.stack([foot, self._target])
+        else:
+            path = self.flown.points
+        if length(path) < 1e-3:
+            return Flown.standing(path[0])
+        limits = replace(goal.limits, unknown="optimistic", speed=min(goal.limits.speed, goal.limits.climb))
+        space = self._finder.spaces(now.local_map, None, limits).widest
+        points = resample(path, self.config.speed.spacing_m)
+        distance = space.distance(points)
+        risen = np.linalg.norm(points - points[0], axis=1)
+        wished = np.minimum(self._finder.least_radius_m(limits), distance[0] + 0.5 * risen)
+        low = np.flatnonzero(distance < wished - 0.05)
+        stop_m = float(risen[low[0]]) - self.config.speed.stop_margin_m if low.size else math.inf
+        self._fails = self._fails + 1 if low.size else 0
+        return self._paced(points, space, goal, start_speed=0.0, reach_m=length(path), stop_m=stop_m)
+
+    def _hold(self, goal: Goal, now: Situation) -> Flown:
+        """Brake on the way, once; then stay."""
+        self._target = self._goal_odom = now.p_odom
+        if self.flown is None:
+            return Flown.standing(now.p_odom)
+        if self._begun:
+            return self.flown
+        return self._stopped(self.flown, now, stop_m=-math.inf)
+
+    def _fly(self, goal: Goal, now: Situation) -> Flown:
+        kept = commit(self.flown, now.p_odom, now.v_odom, time_s=self.config.commit_s)
+        within = self.config.ground_within_m
+        self._goal_odom = at_height(goal.p_odom, goal.agl_m, now.local_map, within_m=within, fallback_z=now.ground_z)
+        spaces = self._finder.spaces(now.local_map, now.ground, goal.limits)
+        rng = np.random.default_rng([self._seed, self._replans])
+        if self.reached and self._good(kept, spaces.widest):
+            return self._flown_along(kept, kept.rest, spaces.widest)
+        route = self._find(spaces, kept, goal, rng)
+        old = self._old_way(kept, route, spaces.widest)
+        if route is None:
+            return self._without_route(kept, old, spaces.widest, now)
+        self._fails = 0
+        self._target, self._at_border = route.target, route.at_border
+        self._substitute, self.iterations = route.substitute, route.iterations
+        if old is not None and route.cost_m > self.config.switch_share * length(old) - self.config.switch_m:
+            way, escape = old, old[:1]
+        else:
+            way, escape = route.path, route.escape
+            self._planned_radius_m = route.space.radius_m
+        beyond = self._beyond(goal, route, now, rng)
+        return self._flown_along(kept, np.vstack([way, beyond[1:]]), route.space, escape=escape)
+
+    # --- parts of flying ---------------------------------------------------------------
+
+    def _find(self, spaces: Spaces, kept: Commitment, goal: Goal, rng: np.random.Generator) -> Route | None:
+        start = kept.head[-1]
+        known = kept.rest if len(kept.rest) else None
+        route = self._finder.find(spaces, start, self._goal_odom, accept_m=goal.radius_m, rng=rng, known_path=known)
+        if route is None and goal.if_blocked == "nearest_free":
+            wide = self.config.route.substitute_m
+            route = self._finder.find(spaces, start, self._goal_odom, accept_m=wide, rng=rng)
+        return route
+
+    def _good(self, kept: Commitment, space: FieldSpace) -> bool:
+        """Is the rest of the old way still as clear as it was planned, but for the slack?"""
+        if len(kept.rest) < 2:
+            return False
+        least = max(
+            self._planned_radius_m - self.config.keep_slack_m,
+            self.hull_radius_m + self.config.route.least_clearance_m,
+        )
+        return math.isinf(clear_m(resample(kept.rest, self.config.speed.spacing_m), space, radius_m=least))
+
+    def _old_way(self, kept: Commitment, route: Route | None, space: FieldSpace) -> Array | None:
+        """The old way to the present target, (N, 3); None: there is none or it is no longer good."""
+        if not self._good(kept, space):
+            return None
+        old = cut(kept.rest, 0.0, max(kept.rest_reach_m, 1e-3))
+        if route is None:
+            return old if self._begun else None
+        gap = float(np.linalg.norm(old[-1] - route.target))
+        if gap < 1e-3:
+            return old
+        near = gap < max(0.5, 0.5 * length(old)) and space.segment_free(old[-1], route.target)
+        return np.vstack([old, route.target]) if near else None
+
+    def _without_route(self, kept: Commitment, old: Array | None, space: FieldSpace, now: Situation) -> Flown:
+        """Keep the old way if it is good; else brake on it before what blocks it."""
+        if old is not None:
+            return self._flown_along(kept, kept.rest, space)
+        self._fails += 1
+        if self.flown is None:
+            self._target = None
+            return Flown.standing(now.p_odom)
+        s, _ = project(self.flown.points, now.p_odom)
+        least = self._finder.least_radius_m(self.goal.limits) if self.goal else self.hull_radius_m
+        blocked_m = clear_m(self.flown.points, space, radius_m=least, from_m=s + 0.2)
+        new_goal = not self._begun or self._fails >= self.config.blocked_after
+        stop_m = -math.inf if new_goal else blocked_m - 2.0 * self.config.speed.stop_margin_m
+        return self._stopped(self.flown, now, stop_m=stop_m)
+
+    def _stopped(self, flown: Flown, now: Situation, *, stop_m: float) -> Flown:
+        assert self.goal is not None
+        speed = self.config.speed
+        return braked(flown, now.p_odom, now.v_odom, self.goal.limits, speed, stop_m=stop_m)
+
+    def _beyond(self, goal: Goal, route: Route, now: Situation, rng: np.random.Generator) -> Array:
+        """The way after the target towards the goal that follows; one point: stop at the target."""
+        if not goal.fly_through or not len(goal.next_p_odom) or route.at_border or route.substitute:
+            return route.target[None]
+        within = self.config.ground_within_m
+        after = at_height(goal.next_p_odom[0], goal.agl_m, now.local_map, within_m=within, fallback_z=now.ground_z)
+        return self._finder.extend(route, after, most_m=self.config.ahead_m, rng=rng)
+
+    def _flown_along(self, kept: Commitment, way: Array, space: FieldSpace, *, escape: Array | None = None) -> Flown:
+        """Smooth the way behind the committed head and give it speeds."""
+        assert self.goal is not None
+        head = kept.head if escape is None else without_repeats(np.vstack([kept.head, escape]))
+        path = head
+        if length(way) > 1e-3:
+            path = smooth(without_repeats(way), space, self.config.smooth, head=head)
+        reach_m = length(path) if self._target is None else project(path, self._target)[0]
+        return self._paced(path, space, self.goal, start_speed=kept.start_speed, reach_m=reach_m)
+
+    def _paced(
+        self,
+        path: Array,
+        space: FieldSpace,
+        goal: Goal,
+        *,
+        start_speed: float,
+        reach_m: float,
+        stop_m: float = math.inf,
+    ) -> Flown:
+        config, limits = self.config, goal.limits
+        known_m = self.hull_radius_m + limits.clearance
+        if self._still >= config.creep_after:
+            known_m = self.hull_radius_m + config.creep_margin_m
+            limits = replace(limits, speed=min(limits.speed, config.creep_speed_m_s))
+        if goal.kind == "takeoff":
+            limits = replace(limits, unknown="optimistic")
+        return with_speeds(
+            path,
+            space,
+            limits,
+            config.speed,
+            hull_radius_m=self.hull_radius_m,
+            known_radius_m=known_m,
+            start_speed=start_speed,
+            reach_m=reach_m,
+            stop_m=stop_m,
+        )
+
+    def _count_standing(self, now: Situation, had: Flown | None) -> None:
+        """Standing although there is a way: first known space is asked for the hull alone."""
+        assert self.flown is not None
+        moves = float(np.linalg.norm(now.v_odom)) >= SLOW_M_S
+        if self.reached or had is None or (moves and self._still < self.config.creep_after):
+            self._still = 0
+        elif not moves:
+            points, _ = self.flown.ahead_until_stop
+            s, _ = project(points, now.p_odom)
+            self._still = self._still + 1 if length(points) - s < 0.3 else self._still
+        elif length(self.flown.ahead_until_stop[0]) > 2.0:
+            self._still = 0
