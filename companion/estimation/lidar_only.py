@@ -31,9 +31,10 @@ class LidarOnlyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     gate: ScanGate = ScanGate(min_range_m=2.5, max_range_m=80.0, hull_half_m=(0.0, 0.0, 0.0))
     map: PointMapConfig = PointMapConfig(voxel_m=0.8, spacing_m=0.2)
-    plane: PlaneConfig = PlaneConfig(neighbour_m=2.0)
+    plane: PlaneConfig = PlaneConfig(neighbour_m=2.0, breadth_m=0.08)
     thin_m: Positive = 0.8  # one point per voxel of this edge is registered
     points: Count = 3000  # and at most so many
+    coarse_sigma_m: Positive = 0.2  # of a point against its plane in the first pass: no IMU guides it
     passes: Count = 2  # deskewing with the motion that the pass before found
     iterations: Count = 8  # Gauss-Newton, per pass
     accel_m_s2: Positive = 4.0  # sigma of what breaks the constant velocity
@@ -63,9 +64,9 @@ class LidarOdometry:
         else:
             self._predict(dt)
             predicted = self.R, self.p
-            for _ in range(self.config.passes):
+            for k in range(self.config.passes):
                 nodes, points = self._deskew(scan)
-                self._fit(points, predicted, dt)
+                self._fit(points, predicted, dt, is_coarse=k == 0)
                 self._set_twist(before, dt)
         self.map.insert(self._thinner.firsts(points, self.config.map.spacing_m), self.R, self.p)
         return self._message(scan, points, nodes)
@@ -96,11 +97,13 @@ class LidarOdometry:
         )
         return nodes, points
 
-    def _fit(self, points_body: Array32, predicted: tuple[Array, Array], dt: float) -> None:
+    def _fit(self, points_body: Array32, predicted: tuple[Array, Array], dt: float, *, is_coarse: bool) -> None:
         """Gauss-Newton on planes and on the prior that the twist hardly changes."""
         c = self.config
         few = self._thinner.centroids(points_body, c.thin_m, at_most=c.points)
-        scan = PlaneRegistration(self.map, few, c.plane)
+        sigma_m = c.coarse_sigma_m if is_coarse else c.plane.sigma_m
+        plane = msgspec.structs.replace(c.plane, sigma_m=sigma_m)
+        scan = PlaneRegistration(self.map, few, plane)
         sigmas = np.repeat([c.angular_accel_rad_s2, c.accel_m_s2], 3) * dt * dt
         prior = np.diag(sigmas**-2)
         for _ in range(c.iterations):

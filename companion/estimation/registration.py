@@ -28,6 +28,7 @@ class PlaneConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     neighbour_m: Positive = 1.5  # the five neighbours lie within
     flatness_m: Positive = 0.1  # and this close to their plane
+    breadth_m: Annotated[float, msgspec.Meta(ge=0)] = 0.05  # and spread across their line by this
     sigma_m: Positive = 0.05  # of a point against its plane
     cauchy: Positive = 4.0  # squared normalised residual that halves the square root of the weight
     inflation: Positive = 3.0  # neighbouring points are not independent: information is divided by it
@@ -95,7 +96,7 @@ def find_planes(
     `valid` (N,) says where there is one; returns how many.
     """
     store = (target.keys, target.value, target.counts, target.pool)
-    limits = (target.config.voxel_m, config.neighbour_m**2, config.flatness_m)
+    limits = (target.config.voxel_m, config.neighbour_m**2, config.flatness_m, 5.0 * config.breadth_m**2)
     return int(_find_planes(store, points, R, p, limits, planes, valid))
 
 
@@ -109,7 +110,7 @@ def _find_planes(store, points, R, p, limits, planes, valid):  # type: ignore[no
             x[i] = R[i, 0] * points[q, 0] + R[i, 1] * points[q, 1] + R[i, 2] * points[q, 2] + p[i]
         for u in range(5):
             near2[u] = limits[1]
-        valid[q] = _nearest_five(store, x, limits[0], near2, near) and _fit_plane(near, limits[2], plane)
+        valid[q] = _nearest_five(store, x, limits[0], near2, near) and _fit_plane(near, limits[2], limits[3], plane)
         if valid[q]:
             for i in range(4):
                 planes[q, i] = plane[i]
@@ -157,7 +158,7 @@ def _nearest_five(store, x, voxel_m, near2, near):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def _fit_plane(near, flatness_m, plane):  # type: ignore[no-untyped-def]
+def _fit_plane(near, flatness_m, breadth, plane):  # type: ignore[no-untyped-def]
     """Smallest eigenvector of the scatter: power iterations on its adjugate, a multiple of its inverse."""
     m0, m1, m2 = 0.0, 0.0, 0.0
     for u in range(5):
@@ -169,6 +170,10 @@ def _fit_plane(near, flatness_m, plane):  # type: ignore[no-untyped-def]
         c01, c02, c12 = c01 + x * y, c02 + x * z, c12 + y * z
     d00, d11, d22 = c11 * c22 - c12 * c12, c00 * c22 - c02 * c02, c00 * c11 - c01 * c01
     d01, d02, d12 = c02 * c12 - c01 * c22, c01 * c12 - c02 * c11, c01 * c02 - c00 * c12
+    # Trace of the adjugate over that of the scatter: about the middle eigenvalue. Five points on
+    # a line, such as a ring on the ground, have no plane, and would hold the scan where it is.
+    if d00 + d11 + d22 < breadth * (c00 + c11 + c22):
+        return False
     if d00 >= d11 and d00 >= d22:
         x, y, z = d00, d01, d02
     elif d11 >= d22:

