@@ -30,6 +30,9 @@ class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """A new route replaces a good old one if it is shorter than this share of it ..."""
     switch_m: Metres = 0.3
     """... less this."""
+    most_strain: Annotated[float, msgspec.Meta(gt=0)] = 1.0
+    """A new way that asks for more than this times the acceleration limit across it waits until the
+    vehicle is slower."""
     ahead_m: Metres = 6.0
     """Planned beyond a goal that is flown through."""
     ground_within_m: Metres = 1.5

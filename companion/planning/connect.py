@@ -11,11 +11,12 @@ DRAWS = 3  # uniforms per iteration
 
 
 @njit(cache=True, nogil=True)
-def connect(steps, nodes, links, heads, counts, draws, step, bucket, out):  # type: ignore[no-untyped-def]
+def connect(steps, nodes, links, heads, counts, box, draws, step, bucket, out):  # type: ignore[no-untyped-def]
     """Grow both trees, one iteration per row of `draws`; once joined, write the path to `out`.
 
     nodes (2, C, 4), links (2, C, 4), heads (2, I, J, K), counts (2,): tree 0 is rooted at the
-    start, tree 1 at the goal. Returns the number of points of the path; 0: not joined yet.
+    start, tree 1 at the goal; samples come from `box` (2, 3).
+    Returns the number of points of the path; 0: not joined yet.
     """
     for row in range(draws.shape[0]):
         a = 0 if counts[0] <= counts[1] else 1
@@ -23,7 +24,7 @@ def connect(steps, nodes, links, heads, counts, draws, step, bucket, out):  # ty
         if max(counts[0], counts[1]) >= nodes.shape[1] - 1:
             return 0
         for k in range(3):
-            nodes[a, counts[a], k] = draws[row, k] * steps.shape[k]
+            nodes[a, counts[a], k] = box[0, k] + draws[row, k] * (box[1, k] - box[0, k])
         if not _extend(steps, nodes[a], links[a], heads[a], counts, a, step, bucket):
             continue
         new = counts[a] - 1

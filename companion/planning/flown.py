@@ -10,7 +10,7 @@ import numpy as np
 from companion.core.messages import Array, Limits
 from companion.planning.polyline import arc_length, at, cut, length, project, resample, without_repeats
 from companion.planning.space import FieldSpace
-from companion.planning.speed_profile import SpeedConfig, known_free_m, spacing_of, speed_profile
+from companion.planning.speed_profile import SpeedConfig, known_free_m, spacing_of, speed_profile, strain
 
 SLOW_M_S = 0.2  # slower than this counts as standing
 _BEHIND_M = 0.5  # kept behind the vehicle, so that it finds itself on the new trajectory
@@ -40,6 +40,10 @@ class Flown:
         speeds = self.speeds[: end + 1].copy()
         speeds[-1] = 0.0
         return self.points[: end + 1], speeds
+
+    def strain(self, accel: float) -> float:
+        """Lateral acceleration over the limit, see `speed_profile.strain`."""
+        return strain(self.points, self.speeds, accel) if len(self.points) > 2 else 0.0
 
     def speed_at(self, s: float) -> float:
         """Planned speed at an arc length."""

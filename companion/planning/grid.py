@@ -78,6 +78,15 @@ def segment_free(steps, p, q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def path_free(steps, cells):  # type: ignore[no-untyped-def]
+    """True if no segment of the polyline (N, 3) meets a blocked cell or leaves the grid."""
+    clear = True
+    for n in range(cells.shape[0] - 1):
+        clear = clear and segment_free(steps, cells[n], cells[n + 1])
+    return clear
+
+
+@njit(cache=True, nogil=True)
 def _to_border(x, i, d):  # type: ignore[no-untyped-def]
     if d > 1e-12:
         return (i + 1 - x) / d

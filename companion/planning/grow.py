@@ -25,11 +25,11 @@ _MOST_NEAR = 200
 
 
 @njit(cache=True, nogil=True)
-def grow(steps, nodes, links, head, counts, best, frame, draws, forced, settings):  # type: ignore[no-untyped-def]
+def grow(steps, nodes, links, head, counts, best, frame, box, draws, forced, settings):  # type: ignore[no-untyped-def]
     """One iteration per row of `draws`; the rows of `forced` (K, 3) are the first samples.
 
     `best` (M, 3) holds the best path, for path-local samples; `frame` (4, 3) the spheroid's
-    rotation and centre.
+    rotation and centre, `box` (2, 3) the corners of the box that is sampled.
     """
     near, gaps = np.empty(_MOST_NEAR + _ANCESTORS, np.int32), np.empty(_MOST_NEAR + _ANCESTORS)
     stack, x, bucket = np.empty(nodes.shape[0], np.int32), np.empty((1, 3)), settings[BUCKET]
@@ -39,7 +39,7 @@ def grow(steps, nodes, links, head, counts, best, frame, draws, forced, settings
         if row < forced.shape[0]:
             _copy(forced, row, x)
         else:
-            _sample(steps.shape, draws[row], nodes, best, counts[BEST], frame, settings, x)
+            _sample(box, draws[row], nodes, best, counts[BEST], frame, settings, x)
         if not _inside(steps.shape, x):
             continue
         closest = nearest(nodes, links, head, x, bucket)
@@ -89,12 +89,13 @@ def _copy(points, n, x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _sample(shape, u, nodes, best, best_count, frame, settings, x):  # type: ignore[no-untyped-def]
+def _sample(box, u, nodes, best, best_count, frame, settings, x):  # type: ignore[no-untyped-def]
     """Goal or anywhere without a path; with one, near it or in the informed spheroid."""
     c_best = nodes[GOAL, COST]
     if c_best >= NEVER:
         for k in range(3):
-            x[0, k] = nodes[GOAL, k] if u[0] < settings[GOAL_BIAS] else u[1 + k] * shape[k]
+            anywhere = box[0, k] + u[1 + k] * (box[1, k] - box[0, k])
+            x[0, k] = nodes[GOAL, k] if u[0] < settings[GOAL_BIAS] else anywhere
         return
     if best_count > 1 and u[0] < settings[LOCAL_SHARE]:
         place = u[0] / settings[LOCAL_SHARE] * (best_count - 1)

@@ -156,7 +156,10 @@ class Replanner:
             way, escape = route.path, route.escape
             self._planned_radius_m = route.space.radius_m
         beyond = self._beyond(goal, route, now, rng)
-        return self._flown_along(kept, np.vstack([way, beyond[1:]]), route.space, escape=escape)
+        flown = self._flown_along(kept, np.vstack([way, beyond[1:]]), route.space, escape=escape)
+        if self.flown is not None and flown.strain(goal.limits.accel) > self.config.most_strain:
+            return self._stopped(self.flown, now, stop_m=-math.inf)  # too fast for it: slow down first
+        return flown
 
     # --- parts of flying ---------------------------------------------------------------
 

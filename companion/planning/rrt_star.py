@@ -142,6 +142,7 @@ class _Search:
         self._best, self._path = np.zeros((_PATH_POINTS, 3)), memory.path
         self._best_cost = NEVER
         self._forced = np.zeros((0, 3))
+        self._box = space.sample_box
         self._frame = np.vstack([_axes(self._ends[1] - self._ends[0]), self._ends.mean(axis=0)])
         self._pair: NDArray[np.int64] | None = None  # node counts of RRT-Connect's trees
 
@@ -168,7 +169,7 @@ class _Search:
         if config.first and self._best_cost >= NEVER and not len(self._forced):
             self._join(draws)
         else:
-            rest = (self._counts, self._best, self._frame, draws, self._forced, self._settings())
+            rest = (self._counts, self._best, self._frame, self._box, draws, self._forced, self._settings())
             grow.grow(self._space.steps, *self._tree, *rest)
             self._forced = self._forced[:0]
             self._keep_if_better()
@@ -198,7 +199,7 @@ class _Search:
             self._pair = np.array([1, 1])
         step = self._config.step_m / self._space.resolution_m
         trees = (memory.nodes, memory.links, memory.heads)
-        arguments = (self._pair, draws, step, self._bucket, self._path)
+        arguments = (self._pair, self._box, draws, step, self._bucket, self._path)
         count = two_trees.connect(self._space.steps, *trees, *arguments)
         if count:
             memory.plant(0, self._ends, self._bucket)

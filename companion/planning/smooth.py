@@ -16,7 +16,7 @@ from numba import njit
 
 from companion.core.messages import Array
 from companion.planning.grid import trilinear
-from companion.planning.polyline import resample
+from companion.planning.polyline import arc_length, cut, length, resample
 from companion.planning.space import FieldSpace
 
 
@@ -29,12 +29,16 @@ class SmoothConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Sweeps over all points."""
     clearance_gain: Annotated[float, msgspec.Meta(ge=0)] = 0.3
     """Share of the missing distance that is made good per sweep."""
+    fine_m: Annotated[float, msgspec.Meta(gt=0)] = 0.1
+    """Distance between points of the result."""
+    roundings: Annotated[int, msgspec.Meta(ge=0)] = 4
+    """Binomial filters over the result: no corner at the points of the coarser spacing."""
     wished_extra_m: Annotated[float, msgspec.Meta(ge=0)] = 0.4
     """Distance wished beyond the planning radius."""
 
 
 def smooth(path: Array, space: FieldSpace, config: SmoothConfig, *, head: Array | None = None) -> Array:
-    """Smoothed `path` (N, 3), m, in steps of about spacing_m; the ends stay.
+    """Smoothed `path` (N, 3), m, in steps of about fine_m; the ends stay.
 
     `head` (M, 3) ends where `path` begins: it is put in front unchanged, and the path leaves
     it without a kink. Only `path` is verified in `space`; where it is not free itself, the
@@ -51,12 +55,22 @@ def smooth(path: Array, space: FieldSpace, config: SmoothConfig, *, head: Array 
         config.iterations,
         np.array([wished, config.clearance_gain / space.resolution_m]),
     )
-    fine = space.to_odom(cells)
-    for share in (1.0, 0.5, 0.25):
-        mixed = share * fine + (1.0 - share) * rough
-        if space.path_free(mixed[len(fixed) :]):
-            return mixed
+    bent = space.to_odom(cells)
+    for share in (1.0, 0.5, 0.25, 0.0):
+        mixed = share * bent + (1.0 - share) * rough
+        begin = float(arc_length(mixed)[len(fixed)])
+        fine = _rounded(resample(mixed, config.fine_m), config.roundings)
+        if space.path_free(cut(fine, begin, length(fine))):
+            return fine
     return np.vstack([fixed, path])
+
+
+def _rounded(points: Array, times: int) -> Array:
+    """Binomial filter over evenly spaced points; the ends stay."""
+    for _ in range(times):
+        points = points.copy()
+        points[1:-1] = 0.5 * points[1:-1] + 0.25 * (points[:-2] + points[2:])
+    return points
 
 
 @njit(cache=True, nogil=True)

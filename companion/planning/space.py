@@ -9,7 +9,6 @@ proves that nothing blocked can be met (sphere tracing, Hart 1996): same answer,
 from __future__ import annotations
 
 import copy
-import itertools
 import math
 from typing import Literal, Protocol
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.messages import Array, Array32, LocalMap
-from companion.planning.grid import WINDOW, build_steps, fill_nearest, sample_field, segment_free
+from companion.planning.grid import WINDOW, build_steps, fill_nearest, path_free, sample_field, segment_free
 
 Cells = NDArray[np.int32]
 Unknown = Literal["blocked", "stop_before", "optimistic"]
@@ -130,8 +129,8 @@ class FieldSpace:
         return bool(segment_free(self.steps, np.clip(inner_p, 0.0, limit), np.clip(inner_q, 0.0, limit)))
 
     def path_free(self, path: Array) -> bool:
-        """All segments of a polyline (N, 3)."""
-        return all(self.segment_free(a, b) for a, b in itertools.pairwise(path))
+        """All segments of a polyline (N, 3), which must lie in the map."""
+        return bool(path_free(self.steps, np.ascontiguousarray(self.to_cells(path))))
 
     def distance(self, points: Array) -> Array:
         """Trilinear distance to the nearest occupied cell (N,), m; truncated as the map's."""
@@ -161,6 +160,13 @@ class FieldSpace:
         """Lowest and highest allowed z of column (i, j): cell centres, odom, m; low > high: none."""
         low, high = (float(band[i, j] + 0.5) * self.resolution_m for band in self._bands[:2])
         return low + float(self.origin[2]), high + float(self.origin[2])
+
+    @property
+    def sample_box(self) -> Array:
+        """Corners (2, 3), in cells, of the box that holds all free cells: the band, map-wide."""
+        nx, ny, _ = self.map.state.shape
+        low, high = int(self._bands[0].min()), int(self._bands[1].max()) + 1
+        return np.array([[0.0, 0.0, float(low)], [float(nx), float(ny), float(max(high, low + 1))]])
 
     def contains(self, point: Array, *, margin_m: float = 0.0) -> bool:
         """Is the point inside the local map, `margin_m` from its border?"""

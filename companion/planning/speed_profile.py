@@ -13,6 +13,7 @@ from companion.planning.grid import first_unknown
 
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+_BEND_POINTS = 3  # curvature is taken over so many points to each side
 
 
 class SpeedConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -95,17 +96,31 @@ def _by_nearness(clearance_m: Array, config: SpeedConfig) -> Array:
     return config.near_speed_m_s + config.near_gain_per_s * beyond
 
 
+def curvature(points: Array) -> Array:
+    """1/m (N,) at evenly spaced points, over a few points to both sides."""
+    bend = np.zeros(len(points))
+    m = min(_BEND_POINTS, (len(points) - 1) // 2)
+    if m == 0:
+        return bend
+    before, after = points[m:-m] - points[: -2 * m], points[2 * m :] - points[m:-m]
+    lengths = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
+    turn = after / np.maximum(lengths[1], 1e-9)[:, None] - before / np.maximum(lengths[0], 1e-9)[:, None]
+    bend[m:-m] = np.linalg.norm(turn, axis=1) / np.maximum(0.5 * (lengths[0] + lengths[1]), 1e-9)
+    return bend
+
+
+def strain(points: Array, speeds: Array, accel: float) -> float:
+    """Largest lateral acceleration over the limit; above 1 no vehicle can follow at these speeds."""
+    return float(np.max(speeds**2 * curvature(points))) / accel
+
+
 def _by_shape(points: Array, limits: Limits, config: SpeedConfig) -> Array:
     """Speed, climb, and sqrt(lateral acceleration / curvature)."""
     if len(points) < 3:
         return np.full(len(points), min(limits.speed, limits.climb))
-    way = np.diff(points, axis=0)
-    lengths = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
-    unit = way / lengths[:, None]
-    bend = np.zeros(len(points))
-    bend[1:-1] = np.linalg.norm(np.diff(unit, axis=0), axis=1) / (0.5 * (lengths[1:] + lengths[:-1]))
-    steep = np.abs(np.concatenate([unit[:1, 2], unit[:, 2]]))
-    curve = np.sqrt(config.lateral_share * limits.accel / np.maximum(bend, 1e-6))
+    way = np.gradient(points, axis=0)
+    steep = np.abs(way[:, 2]) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
+    curve = np.sqrt(config.lateral_share * limits.accel / np.maximum(curvature(points), 1e-6))
     climb = limits.climb / np.maximum(steep, 1e-6)
     speeds: Array = np.minimum(np.minimum(curve, climb), limits.speed)
     return speeds

@@ -85,7 +85,9 @@ class Eyes:
 class Flight:
     """Steps everything; read `vehicle`, `status`, `trace` (N, 3) and `clearance_m` (hull, true)."""
 
-    def __init__(self, local_map, occupied, start, *, gust=0.3, half_m=9.6, seed=1, known=None, config=None, hidden=None):
+    def __init__(
+        self, local_map, occupied, start, *, gust=0.3, half_m=9.6, seed=1, known=None, config=None, hidden=None
+    ):
         self.make_map, self.half_m = local_map, half_m
         self.eyes = Eyes(occupied, known=known)
         self.vehicle = PointMass(start, gust=gust, seed=seed)
