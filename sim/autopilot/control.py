@@ -53,6 +53,10 @@ class Controller:
     def reset(self) -> None:
         """Forget the integrators: before a take-off and when the mode's demands jump."""
         self.velocity_integral[:] = 0.0
+        self.forget_rates()
+
+    def forget_rates(self) -> None:
+        """Forget the rate integrators: on sloping ground they would wind up against the legs."""
         self._rate_state[cascade.INTEGRAL : cascade.INTEGRAL + 3] = 0.0
 
     def position(self, setpoint: Array, state: Array, acceleration: Array, limits: Array, dt: float) -> None:

@@ -133,6 +133,7 @@ class Flight:
         self._level[:] = setpoint
         self._level[[0, 1, 3, 4]] = np.nan
         self._level[[6, 7]] = 0.0
+        self._controller.forget_rates()
         return self._level
 
     def _notice_landing(self, setpoint: Array, contact: bool, dt: float) -> None:
