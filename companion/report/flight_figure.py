@@ -81,7 +81,7 @@ def _from_above(
         xlim=box[0], ylim=box[1], aspect="equal", xlabel="east, m", ylabel="north, m", title="From above"
     )
     figure.colorbar(lines, ax=axes, label="estimate's distance to the truth, cm", shrink=0.6, pad=0.01)
-    axes.legend(loc="upper left", ncols=5)
+    axes.legend(loc="upper left", ncols=5, frameon=True, framealpha=0.9, edgecolor="none", borderpad=0.3)
     style.north_arrow(axes)
     style.scale_bar(axes, 10.0)
 
@@ -123,17 +123,24 @@ def _from_side(axes: Axes, tracks: Tracks, scenery: Scenery, estimate: Track, tr
     for k in np.flatnonzero(near):
         x, r = scenery.stem_xy[k, 0], scenery.stem_diameter_m[k] / 2
         axes.axvspan(x - r, x + r, color=style.TRUNK, alpha=0.25, lw=0)
-    middle = len(scenery.contour_y) // 2
-    axes.fill_between(
-        scenery.contour_x, scenery.ground_z.min(axis=1), scenery.ground_z[:, middle], color=style.GROUND, lw=0
-    )
+    x, lowest, highest = _ground_profile(scenery, box)
+    axes.fill_between(x, np.full_like(x, lowest.min() - 1.0), lowest, color=style.GROUND, lw=0)
+    axes.fill_between(x, lowest, highest, color=style.GROUND, alpha=0.5, lw=0)
     _plans(axes, tracks, 0, 2)
     axes.plot(truth.p[:, 0], truth.p[:, 2], color=style.BLACK, lw=1.8, zorder=4)
     _coloured(axes, estimate, truth, 0, 2)
     top = float(truth.p[:, 2].max()) if len(truth.p) else 3.0
-    low = float(scenery.ground_z.min())
-    axes.set(xlim=box[0], ylim=(min(low, 0.0) - 0.3, top + 1.0), xlabel="east, m", ylabel="up, m")
+    axes.set(xlim=box[0], ylim=(float(lowest.min()) - 0.5, top + 1.0), xlabel="east, m", ylabel="up, m")
     axes.set_title("From the side, looking north")
+
+
+def _ground_profile(scenery: Scenery, box: tuple[tuple[float, float], ...]) -> tuple[Array, Array, Array]:
+    """East (N,), and the lowest and highest ground that the side view looks through, m."""
+    (x0, x1), (y0, y1) = box
+    columns = (scenery.contour_x >= x0) & (scenery.contour_x <= x1)
+    rows = (scenery.contour_y >= y0) & (scenery.contour_y <= y1)
+    ground = scenery.ground_z[columns][:, rows]
+    return scenery.contour_x[columns], ground.min(axis=1), ground.max(axis=1)
 
 
 def _error_over_time(axes: Axes, tracks: Tracks, estimate: Track, truth: Track) -> None:

@@ -46,7 +46,7 @@ def north_arrow(axes: Axes) -> None:
         ha="center",
         va="top",
         fontsize=9,
-        arrowprops={"arrowstyle": "<|-", "color": BLACK, "lw": 1.2},
+        arrowprops={"arrowstyle": "-|>", "color": BLACK, "lw": 1.2},
     )
 
 
