@@ -88,8 +88,8 @@ class FieldSpace:
         low, high = np.zeros((nx, ny), np.int32), np.full((nx, ny), nz - 1, np.int32)
         if ground_z is not None:
             above = (ground_z.astype(np.float64) - self.origin[2]) / self.resolution_m - 0.5
-            low[:] = np.clip(np.ceil(above + agl_m[0] / self.resolution_m), 0, nz)
-            high[:] = np.clip(np.floor(above + agl_m[1] / self.resolution_m), -1, nz - 1)
+            low[:] = np.clip(np.ceil(above + agl_m[0] / self.resolution_m - 1e-3), 0, nz)
+            high[:] = np.clip(np.floor(above + agl_m[1] / self.resolution_m + 1e-3), -1, nz - 1)
         return low, high, _highest_near(low), -_highest_near(-high)
 
     @property

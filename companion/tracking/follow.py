@@ -21,6 +21,9 @@ class FollowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     pursuit: PursuitConfig = PursuitConfig()
     pid: PidConfig = PidConfig()
+    drag_per_s: Annotated[float, msgspec.Meta(ge=0)] = 0.1
+    """Deceleration per speed by rotor drag in still air, fed forward: else the autopilot's integral
+    carries it, and overshoots at the end."""
     yaw_look_m: Metres = 1.5
     """The nose points to the path this far ahead ..."""
     yaw_least_m: Metres = 0.5
@@ -81,8 +84,9 @@ class Follower:
                 self._stop = preview.p.copy()
             return self._stop.copy(), np.zeros(3), np.zeros(3)
         self._stop = None
+        drag = self.config.drag_per_s * self._scale * preview.v
         braking = preview.v * (self._scale - before) / self.period_s
-        return preview.p, self._scale * preview.v, self._scale**2 * preview.a + braking
+        return preview.p, self._scale * preview.v, self._scale**2 * preview.a + braking + drag
 
     def _heading(self, odometry: Odometry) -> tuple[float, float]:
         """(yaw, yaw rate), turning towards what is wished for at most at the limit."""

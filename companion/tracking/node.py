@@ -69,8 +69,8 @@ class TrackingNode(Node):
         fresh = (
             odometry is not None
             and safety is not None
-            and _age_s(now_ns, odometry.stamp_ns) <= config.odometry_stale_s
-            and _age_s(now_ns, safety.stamp_ns) <= config.safety_stale_s
+            and not _older(odometry.stamp_ns, now_ns, config.odometry_stale_s)
+            and not _older(safety.stamp_ns, now_ns, config.safety_stale_s)
         )
         if not fresh or odometry is None or safety is None:
             self._follower.reset()
@@ -78,7 +78,7 @@ class TrackingNode(Node):
         if self._trajectory is None:
             yield topics.SETPOINT(self._hold_here(now_ns, odometry))
             return
-        stale = _age_s(now_ns, self._trajectory.stamp_ns) > config.trajectory_stale_s
+        stale = _older(self._trajectory.stamp_ns, now_ns, config.trajectory_stale_s)
         stop = stale or safety.action in ("hold", "land")
         scale = 0.0 if stop else safety.speed_scale
         yield topics.SETPOINT(self._follower.setpoint(now_ns, odometry, scale=scale))
@@ -98,5 +98,5 @@ class TrackingNode(Node):
         )
 
 
-def _age_s(now_ns: int, stamp_ns: int) -> float:
-    return (now_ns - stamp_ns) * 1e-9
+def _older(stamp_ns: int, now_ns: int, most_s: float) -> bool:
+    return now_ns - stamp_ns > round(most_s * 1e9)

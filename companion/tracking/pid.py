@@ -16,7 +16,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 class PidConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Cross-track error (m) to velocity correction (m/s). The autopilot's own position gain comes on top."""
 
-    kp_per_s: Gain = 0.4
+    kp_per_s: Gain = 0.8
     """Proportional gain."""
     ki_per_s2: Gain = 0.15
     """Integral gain."""

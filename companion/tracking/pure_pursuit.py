@@ -19,7 +19,7 @@ from companion.core.messages import Array
 class PursuitConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How far to look ahead."""
 
-    reaction_s: Annotated[float, msgspec.Meta(ge=0)] = 0.15
+    reaction_s: Annotated[float, msgspec.Meta(ge=0)] = 0.12
     """Lag of the vehicle behind a velocity demand."""
     least_ahead_m: Annotated[float, msgspec.Meta(gt=0)] = 0.15
     """Looked ahead at least: a path that starts with speed 0 must be left, one that ends be met."""

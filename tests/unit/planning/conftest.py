@@ -23,13 +23,14 @@ def _local_map(occupied, *, known=None, origin=(0.0, 0.0, 0.0), ground_z=np.nan,
         gap = (distance_transform_edt(~mask) - 0.5) * resolution_m
         return np.clip(gap, 0.0, 2.0).astype(np.float32)
 
+    distance = field(state == 2)
     return LocalMap(
         stamp_ns=stamp_ns,
         origin_odom=np.array(origin, float),
         resolution_m=resolution_m,
         state=state,
-        distance_m=field(state == 2),
-        unknown_distance_m=field(state != 1),
+        distance_m=distance,
+        unknown_distance_m=distance if known.all() else field(state != 1),
         ground_z_odom=np.full(occupied.shape[:2], ground_z, np.float32),
     )
 

@@ -49,7 +49,7 @@ class PointMass:
         self.a += (demand - self.a) * dt / self.lag_s
         noise = self.rng.standard_normal(3)
         self.gust_a += -self.gust_a * dt / 1.5 + self.gust * np.sqrt(2 * dt / 1.5) * noise
-        self.v = self.v + (self.a + self.gust_a - 0.25 * self.v) * dt
+        self.v = self.v + (self.a + self.gust_a - 0.2 * self.v) * dt
         self.p = self.p + self.v * dt
 
 
@@ -65,7 +65,7 @@ class Eyes:
         ).reshape(-1, 3)
 
     def look(self, p):
-        live = self.rays
+        live = self.rays[: 0 if self.known.all() else None]
         for reach in np.arange(0.0, self.range_m, 0.5 * self.cell):
             cells = np.floor((p + reach * live) / self.cell).astype(int)
             inside = np.all((cells >= 0) & (cells < self.occupied.shape), axis=1)
@@ -85,13 +85,11 @@ class Eyes:
 class Flight:
     """Steps everything; read `vehicle`, `status`, `trace` (N, 3) and `clearance_m` (hull, true)."""
 
-    def __init__(
-        self, local_map, occupied, start, *, gust=0.3, half_m=9.6, seed=1, known=None, config=None, hidden=None
-    ):
+    def __init__(self, local_map, occupied, start, *, gust=0.3, half_m=6.4, seed=1, known=None):
         self.make_map, self.half_m = local_map, half_m
         self.eyes = Eyes(occupied, known=known)
         self.vehicle = PointMass(start, gust=gust, seed=seed)
-        self.planning = PlanningNode(config or PlanningConfig(), hull_radius_m=HULL_M, seed=seed)
+        self.planning = PlanningNode(PlanningConfig(), hull_radius_m=HULL_M, seed=seed)
         self.tracking = TrackingNode(TrackingConfig())
         self.setpoint, self.status, self.trajectory = None, None, None
         self.states, self.trace, self.speeds, self.late = [], [], [], []
