@@ -19,12 +19,13 @@ from companion.core.messages import Array
 class PursuitConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How far to look ahead."""
 
-    reaction_s: Annotated[float, msgspec.Meta(ge=0)] = 0.12
+    reaction_s: Annotated[float, msgspec.Meta(ge=0)] = 0.15
     """Lag of the vehicle behind a velocity demand."""
     least_ahead_m: Annotated[float, msgspec.Meta(gt=0)] = 0.15
     """Looked ahead at least: a path that starts with speed 0 must be left, one that ends be met."""
     slow_m_s: Annotated[float, msgspec.Meta(gt=0)] = 0.5
-    """Below this speed the position demand moves ahead, too, up to least_ahead_m."""
+    """Below this speed the position demand moves ahead, too, up to least_ahead_m, and the
+    acceleration demand fades."""
     back_m: Annotated[float, msgspec.Meta(ge=0)] = 1.0
     """The nearest point is looked for this far back ..."""
     forth_m: Annotated[float, msgspec.Meta(gt=0)] = 4.0
@@ -37,7 +38,7 @@ class Preview:
 
     s_m: float  # arc length of the nearest point
     p: Array  # place to be, (3,)
-    v: Array  # (3,)
+    v: Array  # (3,), as planned
     a: Array  # (3,)
     error: Array  # nearest point minus vehicle, (3,)
     speed: float  # of the profile, m/s
@@ -55,19 +56,14 @@ class Pursuit:
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
         self.along = np.concatenate([[0.0], np.cumsum(steps)])
         self.length_m = float(self.along[-1])
-        self._tangent = np.zeros_like(path)
-        self._accel = np.zeros_like(path)
         self._s: float | None = None  # nearest so far; None: not looked for yet
+        self._tangent, self._turn = np.zeros_like(path), np.zeros_like(path)  # unit; 1/m
+        self._along = np.zeros(len(path))  # v dv/ds, m/s2
+        self._accel_limit = accel_limit
         if self.length_m > 1e-6:
             self._tangent = _unit(np.gradient(path, axis=0))
-            self._accel = _limited(self._demand(), accel_limit)
-
-    def _demand(self) -> Array:
-        """v dv/ds along the tangent plus v^2 dT/ds across it."""
-        faster = np.gradient(0.5 * self.speed**2, self.along)
-        turning = np.gradient(self._tangent, self.along, axis=0)
-        demand: Array = faster[:, None] * self._tangent + (self.speed**2)[:, None] * turning
-        return demand
+            self._turn = np.gradient(self._tangent, self.along, axis=0)
+            self._along = np.gradient(0.5 * speed**2, self.along)
 
     def preview(self, p: Array, v: Array) -> Preview:
         """Demand for a vehicle at `p` with velocity `v` (3,)."""
@@ -77,15 +73,28 @@ class Pursuit:
         ahead = max(float(np.linalg.norm(v)) * config.reaction_s, config.least_ahead_m)
         seen = s + ahead
         lead = config.least_ahead_m * max(1.0 - speed / config.slow_m_s, 0.0)
-        tangent = _unit(self.at(self._tangent, seen)[None])[0]
+        planned = float(np.interp(seen, self.along, self.speed))
+        tangent = _unit(self.at(self._tangent, seen))
         return Preview(
             s_m=s,
             p=self.at(self.path, s + lead),
-            v=float(np.interp(seen, self.along, self.speed)) * tangent,
-            a=self.at(self._accel, seen),
+            v=planned * tangent,
+            a=self._feed_forward(seen, tangent, planned, float(v @ tangent)),
             error=self.at(self.path, s) - p,
             speed=speed,
         )
+
+    def _feed_forward(self, s: float, tangent: Array, planned: float, actual: float) -> Array:
+        """v dv/ds along the tangent plus v^2 dT/ds across it, for a vehicle at `actual` speed.
+
+        One that is slower than planned needs less braking and turning, none when it stands.
+        """
+        share = min(max(actual / max(planned, self.config.slow_m_s), 0.0), 1.0) ** 2
+        along = float(np.interp(s, self.along, self._along))
+        demand = along * (1.0 if along > 0.0 else share) * tangent + share * planned**2 * self.at(self._turn, s)
+        size = float(np.linalg.norm(demand))
+        bounded: Array = demand * min(1.0, self._accel_limit / max(size, 1e-9))
+        return bounded
 
     def at(self, rows: Array, s: float) -> Array:
         """Row (3,) of a table (N, 3) at an arc length, between the ends."""
@@ -114,11 +123,5 @@ class Pursuit:
 
 
 def _unit(rows: Array) -> Array:
-    unit: Array = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+    unit: Array = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-9)
     return unit
-
-
-def _limited(rows: Array, most: float) -> Array:
-    size = np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
-    bounded: Array = rows * np.minimum(1.0, most / size)
-    return bounded

@@ -121,7 +121,7 @@ def test_preview_on_a_circle_has_tangent_and_centripetal_acceleration():
     pursuit = Pursuit(points, np.full(len(points), 2.0), accel_limit=3.0, config=PursuitConfig(reaction_s=0.2))
     angle = 1.0
     p = np.array([5.1 * np.sin(angle), 5 - 5.1 * np.cos(angle), 2.0])  # 0.1 m outside
-    seen = pursuit.preview(p, np.array([2.0, 0.0, 0.0]))
+    seen = pursuit.preview(p, np.array([2 * np.cos(1.08), 2 * np.sin(1.08), 0.0]))
     assert seen.s_m == pytest.approx(5.0, abs=0.01)
     assert np.linalg.norm(seen.error) == pytest.approx(0.1, abs=0.002)
     ahead = angle + 2.0 * 0.2 / 5.0
@@ -133,7 +133,7 @@ def test_velocity_and_acceleration_are_consistent_along_a_speed_ramp():
     points = line(10.0)
     pursuit = Pursuit(points, ramp(points, 9.0), accel_limit=3.0, config=PursuitConfig())
     for x, sign in ((2.0, 1.0), (8.0, -1.0)):
-        seen = pursuit.preview(np.array([x, 0.0, 2.0]), np.zeros(3))
+        seen = pursuit.preview(np.array([x, 0.0, 2.0]), np.array([2.83, 0.0, 0.0]))
         assert np.allclose(seen.a, [sign * 2.0, 0.0, 0.0], atol=0.05)
         pursuit = Pursuit(points, ramp(points, 9.0), accel_limit=3.0, config=PursuitConfig())
 
@@ -165,7 +165,14 @@ def test_it_leaves_a_standing_start_and_ends_at_the_end():
     trace, demands = fly(points, ramp(points, 2.0), seconds=12.0)
     assert np.linalg.norm(trace[-1] - points[-1]) < 0.25  # gusts
     assert trace[:, 0].max() < 6.4
-    assert np.linalg.norm(demands[-1].v_odom) < 0.2 and np.allclose(demands[-1].p_odom, points[-1])
+    assert np.linalg.norm(demands[-1].v_odom) < 0.3 and np.linalg.norm(demands[-1].p_odom - points[-1]) < 0.1
+
+
+def test_a_vehicle_that_stands_is_not_told_to_brake():
+    points = line(6.0)
+    pursuit = Pursuit(points, ramp(points, 2.0), accel_limit=3.0, config=PursuitConfig())
+    seen = pursuit.preview(np.array([5.6, 0.0, 2.0]), np.zeros(3))
+    assert np.allclose(seen.a, 0.0) and seen.v[0] > 0.5
 
 
 @pytest.mark.parametrize(("action", "scale"), [("hold", 0.0), ("land", 0.0)])
