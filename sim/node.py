@@ -87,9 +87,7 @@ class SimNode(Node):
             sample = self._imu.sample(now_ns, force, rate, self.vehicle.rotor_speed)
             yield topics.IMU(sample, delay_ns=_ns(late.imu_ms))
         if self._tick % SLOW_TICKS == 0:
-            yield topics.BARO(
-                self._baro.sample(now_ns, float(self.vehicle.p_world[2])), delay_ns=_ns(late.baro_ms)
-            )
+            yield topics.BARO(self._baro.sample(now_ns, float(self.vehicle.p_world[2])), delay_ns=_ns(late.baro_ms))
             yield topics.RANGE(self._ranged(now_ns), delay_ns=_ns(late.range_ms))
         yield from self._sweep(now_ns, _ns(late.lidar_ms))
         stamp_ns = round((self._frames + 1) * 1e9 / self.config.camera.rate_hz)
@@ -104,9 +102,7 @@ class SimNode(Node):
             return
         knots = knot_stamps(self.config.lidar, stamp_ns, 21, part=part, parts=PIECES)
         p, q = self.vehicle.poses_at(knots)
-        piece = self._renderer.submit_lidar(
-            p, q, stamp_ns=stamp_ns, counter=self._sweeps, part=part, parts=PIECES
-        )
+        piece = self._renderer.submit_lidar(p, q, stamp_ns=stamp_ns, counter=self._sweeps, part=part, parts=PIECES)
         self._pieces += (piece,)
         if len(self._pieces) == PIECES:
             yield topics.LIDAR(JoinedSweep(self._pieces), delay_ns=delay_ns + stamp_ns - now_ns)
@@ -130,9 +126,7 @@ class SimNode(Node):
         self._command = self.autopilot.step(
             now_ns,
             imu=(own.angular_velocity_body, own.specific_force_body),
-            baro_altitude_m=self._autopilot_baro.sample(now_ns, float(v.p_world[2])).altitude_m
-            if slow
-            else None,
+            baro_altitude_m=self._autopilot_baro.sample(now_ns, float(v.p_world[2])).altitude_m if slow else None,
             gps=_fix(self._gps.sample(now_ns, v.p_world, v.v_world)) if gps_due else None,
             range_m=None,
             battery_voltage=v.battery_voltage,

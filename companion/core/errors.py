@@ -14,9 +14,7 @@ class InputError(CompanionError):
 
     exit_code = 2
 
-    def __init__(
-        self, problem: str, *, file: str = "", line: int = 0, field: str = "", valid: str = ""
-    ) -> None:
+    def __init__(self, problem: str, *, file: str = "", line: int = 0, field: str = "", valid: str = "") -> None:
         self.problem, self.file, self.line, self.field, self.valid = problem, file, line, field, valid
         place = f"{file}:{line}: " if file and line else f"{file}: " if file else ""
         where = f"{field}: " if field else ""

@@ -144,9 +144,7 @@ class Reader:
             raise self.fail(node, path, f"{_shown(node)} is not allowed", describe(kind))
         if len(value) < (kind.min_length or 0) or len(value) > (kind.max_length or len(value)):
             most = f" and at most {kind.max_length}" if kind.max_length else ""
-            raise self.fail(
-                node, path, f"{len(value)} characters", f"at least {kind.min_length or 0}{most} characters"
-            )
+            raise self.fail(node, path, f"{len(value)} characters", f"at least {kind.min_length or 0}{most} characters")
         return value
 
     def _bool(self, node: yaml.Node, kind: mi.BoolType, path: Path, unit: str) -> bool:
@@ -191,9 +189,7 @@ class Reader:
     def _union(self, node: yaml.Node, kind: mi.UnionType, path: Path, unit: str) -> Any:
         structs = [t for t in kind.types if isinstance(_bare(t), mi.StructType)]
         if isinstance(node, yaml.MappingNode) and structs:
-            return (
-                self._tagged(node, structs, path) if len(structs) > 1 else self.read(node, structs[0], path)
-            )
+            return self._tagged(node, structs, path) if len(structs) > 1 else self.read(node, structs[0], path)
         plain = [t for t in kind.types if t not in structs]
         null = isinstance(node, yaml.ScalarNode) and node.tag.endswith(":null")
         if structs and (not plain or (not null and all(isinstance(t, mi.NoneType) for t in plain))):
@@ -233,9 +229,7 @@ class Reader:
             values[field.name] = self.read(value, field.type, (*path, name), unit_of(name, field.type))
         for name, field in fields.items():
             if field.required and field.name not in values:
-                raise self.fail(
-                    node, (*path, name), "is missing", describe(field.type, unit_of(name, field.type))
-                )
+                raise self.fail(node, (*path, name), "is missing", describe(field.type, unit_of(name, field.type)))
         return self.build(node, kind.cls, values, path)
 
     def build(self, node: yaml.Node, cls: type[msgspec.Struct], values: dict[str, Any], path: Path) -> Any:
@@ -246,15 +240,11 @@ class Reader:
             own = error.field.rpartition(".")[2]  # a struct does not know where it stands
             where = f"{path_text(path)}.{own}".strip(".")
             line = node.start_mark.line + 1 if self.file else 0
-            raise InputError(
-                error.problem, file=self.file, line=line, field=where, valid=error.valid
-            ) from None
+            raise InputError(error.problem, file=self.file, line=line, field=where, valid=error.valid) from None
         except ValueError as error:
             raise self.fail(node, path, str(error)) from None
 
-    def _entries(
-        self, node: yaml.Node, path: Path, valid: str
-    ) -> dict[str, tuple[yaml.ScalarNode, yaml.Node]]:
+    def _entries(self, node: yaml.Node, path: Path, valid: str) -> dict[str, tuple[yaml.ScalarNode, yaml.Node]]:
         if not isinstance(node, yaml.MappingNode):
             raise self.fail(node, path, f"{_shown(node)} is not a mapping", valid)
         entries: dict[str, tuple[yaml.ScalarNode, yaml.Node]] = {}

@@ -44,9 +44,7 @@ class Document:
 
     def error(self, path: Path, problem: str, *, valid: str = "") -> InputError:
         """An error at `path`, or at the nearest parent that the file really holds."""
-        return InputError(
-            problem, file=self.file, line=self.line_of(path), field=path_text(path), valid=valid
-        )
+        return InputError(problem, file=self.file, line=self.line_of(path), field=path_text(path), valid=valid)
 
     def line_of(self, path: Path) -> int:
         """Line (1-based) of the key or item at `path`, or of its nearest existing parent."""

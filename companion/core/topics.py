@@ -17,9 +17,7 @@ LIDAR = Topic(
     deadline_s=0.35,
     ros_type="sensor_msgs/msg/PointCloud2",
 )
-CAMERA = Topic(
-    "sensors/camera", m.CameraImage, 15.0, recorded=False, deadline_s=0.3, ros_type="sensor_msgs/msg/Image"
-)
+CAMERA = Topic("sensors/camera", m.CameraImage, 15.0, recorded=False, deadline_s=0.3, ros_type="sensor_msgs/msg/Image")
 RANGE = Topic("sensors/range", m.RangeReading, 20.0, deadline_s=0.3, ros_type="sensor_msgs/msg/Range")
 BARO = Topic("sensors/baro", m.BaroReading, 20.0, deadline_s=0.5, ros_type="sensor_msgs/msg/FluidPressure")
 # autopilot in

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.core.messages import Limits, LocalMap
+from companion.core.messages import Limits, LocalMap, freeze
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import with_speeds
 from companion.planning.rrt_star import RRTStar
@@ -51,7 +51,7 @@ def _wall() -> LocalMap:
     distance[9:12, 1:9] = 0.1
     ground = np.full((20, 20), np.nan, np.float32)
     ground[0, 0] = 0.0
-    return LocalMap(
+    wall = LocalMap(
         stamp_ns=0,
         origin_odom=np.zeros(3),
         resolution_m=0.2,
@@ -60,3 +60,5 @@ def _wall() -> LocalMap:
         unknown_distance_m=distance,
         ground_z_odom=ground,
     )
+    freeze(wall)  # read-only arrays are types of their own
+    return wall

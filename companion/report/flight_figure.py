@@ -55,9 +55,7 @@ def _headline(summary: Summary) -> str:
     )
 
 
-def _from_above(
-    figure: Figure, axes: Axes, tracks: Tracks, scenery: Scenery, estimate: Track, truth: Track
-) -> None:
+def _from_above(figure: Figure, axes: Axes, tracks: Tracks, scenery: Scenery, estimate: Track, truth: Track) -> None:
     box = _frame(truth.p, margin=6.0)
     relief = axes.contour(
         scenery.contour_x,
@@ -74,12 +72,8 @@ def _from_above(
     lines = _coloured(axes, estimate, truth, 0, 1)
     if len(truth.p):
         axes.plot(*truth.p[0, :2], "o", ms=8, mfc="white", mec=style.BLACK, label="take-off", zorder=7)
-        axes.plot(
-            *truth.p[-1, :2], "s", ms=7, mfc=style.VERMILION, mec=style.BLACK, label="landing", zorder=7
-        )
-    axes.set(
-        xlim=box[0], ylim=box[1], aspect="equal", xlabel="east, m", ylabel="north, m", title="From above"
-    )
+        axes.plot(*truth.p[-1, :2], "s", ms=7, mfc=style.VERMILION, mec=style.BLACK, label="landing", zorder=7)
+    axes.set(xlim=box[0], ylim=box[1], aspect="equal", xlabel="east, m", ylabel="north, m", title="From above")
     figure.colorbar(lines, ax=axes, label="estimate's distance to the truth, cm", shrink=0.6, pad=0.01)
     axes.legend(loc="upper left", ncols=5, frameon=True, framealpha=0.9, edgecolor="none", borderpad=0.3)
     style.north_arrow(axes)

@@ -55,6 +55,4 @@ def scale_bar(axes: Axes, length_m: float) -> None:
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     x, y = x0 + 0.03 * (x1 - x0), y0 + 0.035 * (y1 - y0)
     axes.plot([x, x + length_m], [y, y], color=BLACK, lw=2.5, solid_capstyle="butt", zorder=9)
-    axes.text(
-        x + length_m / 2, y + 0.012 * (y1 - y0), f"{length_m:g} m", ha="center", va="bottom", fontsize=8
-    )
+    axes.text(x + length_m / 2, y + 0.012 * (y1 - y0), f"{length_m:g} m", ha="center", va="bottom", fontsize=8)

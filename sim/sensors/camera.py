@@ -53,9 +53,7 @@ class Camera:
         self._flat, self._starts = mip_levels(load_tile())
         self._vignette = _vignette(pinhole, config.vignetting)
         width, height = pinhole.width_px, pinhole.height_px
-        self._corner_dirs = _directions(
-            pinhole, np.arange(0, width + 1, _STEP), np.arange(0, height + 1, _STEP)
-        )
+        self._corner_dirs = _directions(pinhole, np.arange(0, width + 1, _STEP), np.arange(0, height + 1, _STEP))
         self._pixel_dirs = _directions(pinhole, np.arange(width) + 0.5, np.arange(height) + 0.5)
 
     def frame(
@@ -84,9 +82,7 @@ class Camera:
         """Depth along the optical axis (H, W), inf: sky, and the triangle of each pixel."""
         corners, rows, columns = self._corner_dirs, *self._corner_dirs.shape[:2]
         far, ids = self._caster.cast(_rays(corners.reshape(-1, 3), R_world_cam, p_world))
-        depth, triangle, unsure = _interpolate(
-            far.reshape(rows, columns), ids.reshape(rows, columns), self._classes
-        )
+        depth, triangle, unsure = _interpolate(far.reshape(rows, columns), ids.reshape(rows, columns), self._classes)
         dirs = self._pixel_dirs.reshape(-1, 3)[unsure]
         far, ids = self._caster.cast(_rays(dirs, R_world_cam, p_world))
         depth.reshape(-1)[unsure], triangle.reshape(-1)[unsure] = far, ids
@@ -194,9 +190,7 @@ def _draw(view, surface, scale, light, pixels):  # type: ignore[no-untyped-def]
                 x = p[0] + R[0, 0] * d0 + R[0, 1] * d1 + R[0, 2] * t
                 y = p[1] + R[1, 0] * d0 + R[1, 1] * d1 + R[1, 2] * t
                 if classes[triangle[i, j]] == GROUND:
-                    grey = _sample(
-                        flat, starts, x * per_m + _CENTER_PX, y * per_m + _CENTER_PX, t * per_depth
-                    )
+                    grey = _sample(flat, starts, x * per_m + _CENTER_PX, y * per_m + _CENTER_PX, t * per_depth)
                 else:
                     z = p[2] + R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * t
                     bark = _sample(flat, starts, 2.0 * (x - y) * per_m, 0.7 * z * per_m, t * per_depth)

@@ -88,12 +88,10 @@ class Imu:
             [config.accel_bias_m_s2, config.gyro_bias_rad_s], 3
         )
         rate = config.rate_hz
-        self._white = math.sqrt(rate) * np.repeat(
-            [config.accel_noise_m_s2_sqrt_hz, config.gyro_noise_rad_s_sqrt_hz], 3
+        self._white = math.sqrt(rate) * np.repeat([config.accel_noise_m_s2_sqrt_hz, config.gyro_noise_rad_s_sqrt_hz], 3)
+        self._walk = np.repeat([config.accel_bias_walk_m_s2_sqrt_s, config.gyro_bias_walk_rad_s_sqrt_s], 3) / math.sqrt(
+            rate
         )
-        self._walk = np.repeat(
-            [config.accel_bias_walk_m_s2_sqrt_s, config.gyro_bias_walk_rad_s_sqrt_s], 3
-        ) / math.sqrt(rate)
         self._limit = np.repeat([config.accel_max_m_s2, config.gyro_max_rad_s], 3)
         self._tone, self._band = _amplitudes(config.vibration)
         v = config.vibration
@@ -144,10 +142,7 @@ class Imu:
 def _amplitudes(v: Vibration) -> tuple[Array, Array]:
     """Per axis (6,): amplitude of each rotor's tone and deviation of the band's drive."""
     rms = v.isolation * np.array(
-        [v.accel_lateral_m_s2] * 2
-        + [v.accel_vertical_m_s2]
-        + [v.gyro_lateral_rad_s] * 2
-        + [v.gyro_vertical_rad_s]
+        [v.accel_lateral_m_s2] * 2 + [v.accel_vertical_m_s2] + [v.gyro_lateral_rad_s] * 2 + [v.gyro_vertical_rad_s]
     )
     share = np.array(
         [v.tone_share_accel_lateral] * 2

@@ -113,9 +113,7 @@ class Lidar:
         loss = 1.0 - (1.0 - c.dropout) * (1.0 - lost_fraction)
         _disturb(ranges, seen, uniform, (loss, dust_fraction, c.range_min_m, c.range_max_m))
         noise = (c.range_sigma_m, c.range_sigma_per_m, np.radians(c.angle_sigma_deg), c.range_max_m)
-        points, ages, misses, miss_ages = _pack(
-            dirs, phases, ranges, seen, normal, noise, (c.sweep_s, c.miss_stride)
-        )
+        points, ages, misses, miss_ages = _pack(dirs, phases, ranges, seen, normal, noise, (c.sweep_s, c.miss_stride))
         return freeze(  # type: ignore[no-any-return]
             LidarScan(
                 stamp_ns=stamp_ns,
@@ -142,9 +140,7 @@ class Lidar:
         ranges[order], triangles[order] = far, ids
         return ranges, triangles
 
-    def _through_thin(
-        self, rays: Array32, ranges: Array32, triangles: NDArray[np.uint32], uniform: Array32
-    ) -> None:
+    def _through_thin(self, rays: Array32, ranges: Array32, triangles: NDArray[np.uint32], uniform: Array32) -> None:
         """Let beams that a thin thing did not return go on to what stands behind it, in place."""
         divergence = 1e-3 * self.config.divergence_mrad
         passing, onward, gone = _weak(rays, ranges, triangles, self._widths_m, uniform, divergence)

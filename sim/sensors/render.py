@@ -114,9 +114,7 @@ class _Base(ABC):
 class InlineRenderer(_Base):
     """Renders at once, in the calling thread."""
 
-    def __init__(
-        self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int
-    ) -> None:
+    def __init__(self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int) -> None:
         self.cpu_s = {"lidar": 0.0, "camera": 0.0}
         self._sensors = Sensors(RenderSetup(world.mesh, lidar, camera, rig, seed))
         self._sensors.warm()
@@ -139,9 +137,7 @@ class WorkerRenderer(_Base):
     the worker's own traceback.
     """
 
-    def __init__(
-        self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int
-    ) -> None:
+    def __init__(self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int) -> None:
         self.cpu_s = {"lidar": 0.0, "camera": 0.0}
         self._worker = Worker(RenderSetup(world.mesh, lidar, camera, rig, seed), self.cpu_s)
 

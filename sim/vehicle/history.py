@@ -118,12 +118,6 @@ def _record(ring, step, before, x, moved_by):  # type: ignore[no-untyped-def]
     qw, qx, qy, qz = aw + bw, ax + bx, ay + by, az + bz
     n = 2.0 / (qw * qw + qx * qx + qy * qy + qz * qz)
     fx, fy, fz = x[3] - before[3], x[4] - before[4], x[5] - before[5] + GRAVITY_M_S2 * moved_by
-    row[7] = (
-        last[7] + fx - n * ((qy * qy + qz * qz) * fx - (qx * qy + qw * qz) * fy - (qx * qz - qw * qy) * fz)
-    )
-    row[8] = (
-        last[8] + fy - n * ((qx * qx + qz * qz) * fy - (qx * qy - qw * qz) * fx - (qy * qz + qw * qx) * fz)
-    )
-    row[9] = (
-        last[9] + fz - n * ((qx * qx + qy * qy) * fz - (qx * qz + qw * qy) * fx - (qy * qz - qw * qx) * fy)
-    )
+    row[7] = last[7] + fx - n * ((qy * qy + qz * qz) * fx - (qx * qy + qw * qz) * fy - (qx * qz - qw * qy) * fz)
+    row[8] = last[8] + fy - n * ((qx * qx + qz * qz) * fy - (qx * qy - qw * qz) * fx - (qy * qz + qw * qx) * fz)
+    row[9] = last[9] + fz - n * ((qx * qx + qy * qy) * fz - (qx * qz + qw * qy) * fx - (qy * qz - qw * qx) * fy)

@@ -38,9 +38,7 @@ def assemble(parts: list[Mesh]) -> Mesh:
 def ground_mesh(heights: Array, origin_xy: Array, cell_m: float) -> Mesh:
     """Two triangles per cell of a height field (nx, ny), split as in terrain._height."""
     nx, ny = heights.shape
-    x, y = np.meshgrid(
-        origin_xy[0] + cell_m * np.arange(nx), origin_xy[1] + cell_m * np.arange(ny), indexing="ij"
-    )
+    x, y = np.meshgrid(origin_xy[0] + cell_m * np.arange(nx), origin_xy[1] + cell_m * np.arange(ny), indexing="ij")
     corner = (np.arange(nx - 1)[:, None] * ny + np.arange(ny - 1)[None, :]).ravel()
     lower = np.stack([corner, corner + ny, corner + 1], axis=1)
     upper = np.stack([corner + ny, corner + ny + 1, corner + 1], axis=1)
@@ -63,9 +61,7 @@ def tube_mesh(cones: Array, kind: int) -> Mesh:
     v = np.cross(axis, u)
     ring = swell * (np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None])
     base, tip = cones[:, None, :3], (cones[:, :3] + cones[:, 6:7] * axis)[:, None]
-    rings = np.concatenate(
-        [base + cones[:, 7, None, None] * ring, tip + cones[:, 8, None, None] * ring], axis=1
-    )
+    rings = np.concatenate([base + cones[:, 7, None, None] * ring, tip + cones[:, 8, None, None] * ring], axis=1)
     i = np.arange(sides)
     j = (i + 1) % sides
     faces = np.concatenate([np.stack([i, j, i + sides], 1), np.stack([j, j + sides, i + sides], 1)])

@@ -20,9 +20,7 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 Span = tuple[NotNegative, NotNegative]
 
 
-class EmptySpec(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="empty"
-):
+class EmptySpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="empty"):
     """Ground without trees; also the ground of the other kinds."""
 
     seed: Annotated[int, msgspec.Meta(ge=0)] | None = None  # fixes the layout; None: the flight's own seed

@@ -79,14 +79,10 @@ def _column(names: list[str], candidates: tuple[str, ...], file: str) -> str:
 def _scale(spec: StemsSpec, column: str) -> float:
     stated = _DIAMETER[column]
     if stated and spec.unit and stated != spec.unit:
-        raise InputError(
-            f"{spec.unit} contradicts the column {column}", file=spec.file, field="unit", valid=stated
-        )
+        raise InputError(f"{spec.unit} contradicts the column {column}", file=spec.file, field="unit", valid=stated)
     unit = stated or spec.unit
     if not unit:
-        raise InputError(
-            f"the column {column} does not say its unit", file=spec.file, field="unit", valid="cm, m"
-        )
+        raise InputError(f"the column {column} does not say its unit", file=spec.file, field="unit", valid="cm, m")
     return _SCALE[unit]
 
 
@@ -99,9 +95,7 @@ def _of_plot(
     single = len(plots) <= 1 or (column == "id" and len(plots) == len(rows))
     if column is None or single:
         if spec.plot is not None:
-            raise InputError(
-                "the file holds a single plot", file=spec.file, field="plot", valid="leave it out"
-            )
+            raise InputError("the file holds a single plot", file=spec.file, field="plot", valid="leave it out")
         return rows
     if str(spec.plot) not in plots:
         problem = "the file holds several" if spec.plot is None else f"no plot {spec.plot}"

@@ -105,9 +105,7 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
     )
 
 
-def _stand(
-    spec: WorldSpec, streams: Mapping[str, np.random.Generator]
-) -> tuple[Array, Array, Array, Array, Array]:
+def _stand(spec: WorldSpec, streams: Mapping[str, np.random.Generator]) -> tuple[Array, Array, Array, Array, Array]:
     """Stems (N, 2), diameters, heights, and the stand's corners, in the map's own coordinates."""
     if isinstance(spec, StemsSpec):
         measured = read_stems(spec)
@@ -132,9 +130,7 @@ def _start(spec: WorldSpec, xy: Array, dbh_m: Array, low: Array, high: Array) ->
     room = stand.free_radius(xy, dbh_m, start)
     if isinstance(spec, StemsSpec) and room < spec.clearing_m:
         valid = f"at most {room:.2f} at the start {start[0]:.2f}, {start[1]:.2f}"
-        raise InputError(
-            f"no room of {spec.clearing_m:g} m without felling a tree", field="clearing_m", valid=valid
-        )
+        raise InputError(f"no room of {spec.clearing_m:g} m without felling a tree", field="clearing_m", valid=valid)
     return start
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from companion.core.messages import LocalMap
+from companion.core.messages import LocalMap, freeze
 
 RESOLUTION_M = 0.2
 
@@ -24,7 +24,7 @@ def _local_map(occupied, *, known=None, origin=(0.0, 0.0, 0.0), ground_z=np.nan,
         return np.clip(gap, 0.0, 2.0).astype(np.float32)
 
     distance = field(state == 2)
-    return LocalMap(
+    message = LocalMap(
         stamp_ns=stamp_ns,
         origin_odom=np.array(origin, float),
         resolution_m=resolution_m,
@@ -33,6 +33,7 @@ def _local_map(occupied, *, known=None, origin=(0.0, 0.0, 0.0), ground_z=np.nan,
         unknown_distance_m=distance if known.all() else field(state != 1),
         ground_z_odom=np.full(occupied.shape[:2], ground_z, np.float32),
     )
+    return freeze(message)
 
 
 def _forest(rng, *, size_m=(40.0, 40.0, 8.0), stems_per_ha=400.0, keep_clear=(), branches=True):

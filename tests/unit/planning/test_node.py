@@ -5,6 +5,7 @@ import pytest
 
 from companion.core import topics
 from companion.core.messages import Odometry
+from companion.planning import connect, grid, grow, shortcut, smooth, tree
 from companion.planning.config import PlanningConfig
 from companion.planning.node import PlanningNode
 from companion.planning.polyline import arc_length
@@ -236,3 +237,16 @@ def test_two_nodes_with_the_same_seed_say_the_same(flights, local_map, forest):
         bench.goal(flights.goal_at([27.0, 10.0, 2.0], blocked="nearest_free"))
         said.append([bench.plan()[0].p_odom.tobytes() for _ in range(3)])
     assert said[0] == said[1]
+
+
+def test_nothing_is_compiled_in_flight(flights, local_map):
+    kernels = [k for module in (connect, grid, grow, shortcut, smooth, tree) for k in vars(module).values()]
+    kernels = [k for k in kernels if hasattr(k, "signatures")]
+    occupied = hall()
+    trunk(occupied, 8.0, 6.0)
+    bench = Bench(flights, local_map, occupied, [2.0, 6.0, 2.0])
+    before = sum(len(k.signatures) for k in kernels)
+    bench.plan()
+    bench.goal(flights.goal_at([14.0, 6.0, 2.0], through=True, after=[[20.0, 6.0, 2.0]], agl_m=2.0))
+    bench.plan()
+    assert sum(len(k.signatures) for k in kernels) == before

@@ -1,5 +1,7 @@
 """The distance field's answers against brute force."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,7 +85,9 @@ def test_nearest_free_is_nearest(world):
 
 def test_ground_is_filled_from_the_nearest_column(world, local_map):
     partly = local_map(np.zeros((30, 20, 5), bool))
-    partly.ground_z_odom[3, 4], partly.ground_z_odom[25, 10] = 1.0, 2.0
+    seen = np.full((30, 20), np.nan, np.float32)
+    seen[3, 4], seen[25, 10] = 1.0, 2.0
+    partly = replace(partly, ground_z_odom=seen)
     filled = fill_ground(partly)
     assert filled[3, 4] == 1.0 and filled[0, 0] == 1.0 and filled[29, 19] == 2.0 and not np.isnan(filled).any()
     nothing = local_map(np.zeros((4, 4, 4), bool))

@@ -78,9 +78,7 @@ def test_an_older_input_never_gives_a_milder_verdict(a, b, c, d, std, quality, b
 
 @given(ages, ages, ages)
 def test_on_the_ground_only_odometry_counts_and_nothing_lands(odometry, lidar, local_map):
-    health = dataclasses.replace(
-        FINE, airborne=False, odometry_age_s=odometry, lidar_age_s=lidar, map_age_s=local_map
-    )
+    health = dataclasses.replace(FINE, airborne=False, odometry_age_s=odometry, lidar_age_s=lidar, map_age_s=local_map)
     assert assess(health, CONFIG).action == ("hold" if odometry > CONFIG.odometry_hold_s else "ok")
 
 

@@ -83,9 +83,7 @@ def test_angular_momentum_stays_while_rotors_spin_up() -> None:
 def test_gyroscopic_torque_does_no_work(omega: list[float]) -> None:
     params, x = vacuum(), tumbling(rotors=0.0)
     x[10:13], x[13:] = omega, (100.0, 300.0, 500.0, 700.0)
-    torque = (
-        np.array(params.airframe.inertia_kg_m2) @ derivative(pack(params), x, x[13:], wind_world=CALM)[10:13]
-    )
+    torque = np.array(params.airframe.inertia_kg_m2) @ derivative(pack(params), x, x[13:], wind_world=CALM)[10:13]
     assert abs(torque @ x[10:13]) < 1e-9 * (1 + np.linalg.norm(torque) * np.linalg.norm(x[10:13]))
 
 
@@ -128,8 +126,7 @@ def test_ground_effect_follows_cheeseman_and_bennett() -> None:
         gain = 1 + dx[5] / GRAVITY_M_S2
         assert gain == pytest.approx(1 / (1 - (r / (4 * (height + hub))) ** 2), rel=1e-9)
     near, far = (
-        derivative(pack(PARAMS), hovering(h), hovering()[13:], wind_world=CALM, ground_z=ground)[5]
-        for h in (0.2, 5.0)
+        derivative(pack(PARAMS), hovering(h), hovering()[13:], wind_world=CALM, ground_z=ground)[5] for h in (0.2, 5.0)
     )
     assert near > far + 0.1
 

@@ -15,9 +15,7 @@ QUIET = msgspec.structs.replace(load_vibration(), isolation=0.0)
 DATA = Path("/work/shared/data/imu_rtk_quadrotor_ansfl")
 
 
-def record(
-    config: ImuConfig, count: int, *, rotor: float = 0.0, seed: int = 1, stream: int = 0
-) -> np.ndarray:
+def record(config: ImuConfig, count: int, *, rotor: float = 0.0, seed: int = 1, stream: int = 0) -> np.ndarray:
     """(N, 6): specific force and rate at rest."""
     imu = Imu(config, seed=seed, hover_speed_rad_s=566.0, stream=stream)
     speeds, zero = rotor + np.array([0.0, 7.0, -4.0, -3.0]) * (rotor > 0), np.zeros(3)

@@ -88,9 +88,7 @@ def test_range_to_a_plane_has_the_stated_noise(meadow):
     down = Mount(rpy_deg=(0.0, 90.0, 0.0))
     lidar, exact = make(meadow, config, down), make(meadow, CLEAN, down)
     p, q = still([0.0, 0.0, 10.0])
-    pairs = [
-        (lidar.scan(p, q, stamp_ns=0, counter=k), exact.scan(p, q, stamp_ns=0, counter=k)) for k in range(3)
-    ]
+    pairs = [(lidar.scan(p, q, stamp_ns=0, counter=k), exact.scan(p, q, stamp_ns=0, counter=k)) for k in range(3)]
     noisy = np.concatenate([np.linalg.norm(a.points_sensor, axis=1) for a, _ in pairs])
     true = np.concatenate([np.linalg.norm(b.points_sensor, axis=1) for _, b in pairs])
     for low, high in ((10.0, 12.0), (25.0, 35.0)):

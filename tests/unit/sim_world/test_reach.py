@@ -17,18 +17,14 @@ def test_range_to_a_plane_is_exact():
     for angle in np.linspace(0.1, math.pi / 2, 7):
         direction = np.array([math.cos(angle), 0.0, -math.sin(angle)])
         expected = 3.0 / math.sin(angle)
-        assert world.range_to_surface(np.array([1.0, 2.0, 3.0]), direction) == pytest.approx(
-            expected, abs=1e-9
-        )
+        assert world.range_to_surface(np.array([1.0, 2.0, 3.0]), direction) == pytest.approx(expected, abs=1e-9)
     assert world.range_to_surface(np.array([0.0, 0.0, 3.0]), np.array([0.0, 0.0, 1.0])) == math.inf
     assert world.range_to_surface(np.array([0.0, 0.0, 70.0]), np.array([0.0, 0.0, -1.0])) == math.inf
     assert world.range_to_surface(np.array([math.nan, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])) == math.inf
 
 
 def test_range_to_an_upright_trunk_is_exact(tmp_path):
-    (tmp_path / "one.csv").write_text(
-        "x_m,y_m,dbh_m,h_m\n0,0,0.4,20\n30,0,0.4,20\n0,30,0.4,20\n30,30,0.4,20\n"
-    )
+    (tmp_path / "one.csv").write_text("x_m,y_m,dbh_m,h_m\n0,0,0.4,20\n30,0,0.4,20\n0,30,0.4,20\n30,30,0.4,20\n")
     world = load_world(f"stems:{tmp_path}/one.csv", seed=0, options={**FLAT, "lean_deg": 0.0, "crown": False})
     x, y = world.stems.x[0], world.stems.y[0]
     p = np.array([x + 5.0, y + 5.0, 1.3])

@@ -86,9 +86,7 @@ def test_branches_have_the_asked_number_size_and_height():
         "branch_length_m": [0.4, 0.9],
         "lean_deg": 0.0,
     }
-    world = load_world(
-        "poisson", seed=3, options={**asked, "branch_height_m": [1.0, 5.0], "roughness_m": 0.0}
-    )
+    world = load_world("poisson", seed=3, options={**asked, "branch_height_m": [1.0, 5.0], "roughness_m": 0.0})
     branches = world.cones[world.kinds == BRANCH_CONE]
     assert len(branches) > 0.97 * 20 * len(world.stems)  # those over the start are cut
     assert branches[:, 7].min() >= 0.005
@@ -138,9 +136,7 @@ def test_slope_and_roughness_are_the_asked_ones():
 
 
 @needs_data
-@pytest.mark.parametrize(
-    ("file", "count", "mean_dbh_m"), [("longleaf", 584, 0.2684), ("spruces", 134, 0.2504)]
-)
+@pytest.mark.parametrize(("file", "count", "mean_dbh_m"), [("longleaf", 584, 0.2684), ("spruces", 134, 0.2504)])
 def test_real_stem_maps_load_whole(file, count, mean_dbh_m):
     path = DATA / "forest_stem_maps" / f"{file}.csv"
     world = load_world(f"stems:{path}", seed=0)
@@ -227,9 +223,7 @@ def test_a_yaml_file_may_name_a_stem_map_beside_it(tmp_path):
 def test_every_world_of_ours_loads_by_name_and_starts_free(file):
     world = load_world(file.stem, seed=3)
     assert world.name == file.stem
-    assert world.range_to_surface(np.array([0.0, 0.0, 30.0]), np.array([0.0, 0.0, -1.0])) == pytest.approx(
-        30.0
-    )
+    assert world.range_to_surface(np.array([0.0, 0.0, 30.0]), np.array([0.0, 0.0, -1.0])) == pytest.approx(30.0)
     assert all(value.flags.writeable is False for value in (world.cones, world.heights, world.mesh.vertices))
 
 
