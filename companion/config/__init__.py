@@ -23,7 +23,7 @@ from companion.safety.assess import SafetyConfig
 from companion.tracking.node import TrackingConfig
 
 DELAY_MS: dict[str, dict[str, float]] = {
-    # p95 of the compute time on a 2-core machine, rounded up; see docs/performance.md.
+    # p95 of the compute time on a 2-core machine, rounded up; see docs/reference/performance.md.
     "LioNode": {"sensors/lidar": 15.0, "sensors/camera": 3.0},
     "GraphNode": {"estimation/likelihood": 8.0},
     "MappingNode": {"estimation/registered_scan": 25.0},

@@ -1,0 +1,1 @@
+"""Models of the sensors: what they measure, and what spoils it."""
