@@ -134,7 +134,7 @@ class CameraTracker:
         origin = p + R @ self._p
         downward = rays[:, 2] < -0.2
         depth = np.where(downward, (origin[2] - self._ground_m) / np.maximum(-rays[:, 2], 0.2), 0.0)
-        found, valid = np.empty((len(corners), 4)), np.empty(len(corners), np.bool_)
+        found, valid = np.zeros((len(corners), 4)), np.zeros(len(corners), np.bool_)
         for _ in range(4):
             at = origin + rays * depth[:, None]
             find_planes(target, at, np.eye(3), np.zeros(3), planes, found, valid)

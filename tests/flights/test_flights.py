@@ -42,6 +42,7 @@ def test_a_step_that_cannot_be_done_in_time_ends_in_a_landing(fly):
 steps:
   - {do: takeoff, alt: 2.0}
   - {do: goto, at: [40, 0, 2], timeout_s: 5, on_fail: {do: land_here}}
+  - {do: land}
 """,
         seed=2,
     )
@@ -58,6 +59,7 @@ def test_a_goal_inside_a_trunk_does_not_keep_it_hovering(fly, stem_goal):
 steps:
   - {{do: takeoff, alt: 2.0}}
   - {{do: goto, at: [{x:.2f}, {y:.2f}, 2], if_blocked: fail, timeout_s: 60, on_fail: {{do: land_here}}}}
+  - {{do: land}}
 """,
         seed=3,
     )
