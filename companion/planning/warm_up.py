@@ -19,7 +19,9 @@ def warm_up(config: PlanningConfig, *, hull_radius_m: float) -> None:
     space = FieldSpace(local_map, radius_m=0.2, ground_z=ground, agl_m=(0.0, 9.0))
     start, goal = np.array([1.0, 1.0, 1.0]), np.array([3.0, 1.0, 1.0])
     seed = np.random.default_rng(0)
-    plan = RRTStar(config.rrt_star).plan(start, goal, space, rng=seed, iterations=500, known_path=goal[None])
+    planner = RRTStar(config.rrt_star)
+    planner.plan(start, goal, space, rng=seed, iterations=500)  # RRT-Connect first
+    plan = planner.plan(start, goal, space, rng=seed, iterations=500, known_path=goal[None])
     path = smooth(plan.path, space, config.smooth)
     limits = Limits(
         speed=1.0,
