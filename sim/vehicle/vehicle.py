@@ -225,6 +225,7 @@ def _drain(model, x, scalars):  # type: ignore[no-untyped-def]
 def _ground_under(m, x, heights, field, ground_z):  # type: ignore[no-untyped-def]
     """Ground under the body's origin and, near it, under each leg."""
     ground_z[0] = _height(heights, field[:2], field[2], x[0], x[1])
+    ground_z[1:] = ground_z[0]  # a step may begin above 1 m and end below it
     if x[2] - ground_z[0] >= 1.0:
         return
     R = _rotation(x)
