@@ -41,8 +41,10 @@ class Simulator:
         )
 
     def cpu_s(self, node_cpu_s: float) -> dict[str, float]:
-        """CPU seconds per part of the simulator; rendering may have run in its own process."""
-        return {"SimNode": node_cpu_s, **self.renderer.cpu_s}
+        """CPU seconds per part of the simulator, each counted once wherever rendering ran."""
+        rendered = self.renderer.cpu_s
+        inline = sum(rendered.values()) if isinstance(self.renderer, InlineRenderer) else 0.0
+        return {"SimNode": node_cpu_s - inline, **rendered}
 
     def describe(self) -> str:
         """The simulator's configuration as YAML."""
