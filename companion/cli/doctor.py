@@ -19,7 +19,7 @@ from rich.table import Table
 State = Literal["ok", "warn", "missing"]
 _LIBRARIES = (
     "numpy", "scipy", "numba", "gtsam", "libusb-package", "opencv-python-headless", "pymavlink",
-    "fastcrc", "msgspec", "PyYAML", "typer", "rich", "matplotlib", "pillow",
+    "fastcrc", "msgspec", "xxhash", "PyYAML", "typer", "rich", "matplotlib", "pillow",
 )  # fmt: skip
 
 

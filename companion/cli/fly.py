@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -22,6 +23,8 @@ from companion.runtime.flight import Flight
 from companion.runtime.flight import Progress as Where
 from companion.runtime.flight_log import FlightLog
 from companion.stack import build
+
+REHEARSAL_S = 1.6  # standing: a second of rest, then scans and images are registered
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,15 +89,26 @@ def fly_request(request: Request, console: Console) -> Outcome:
     request.out.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     with simulation.open_simulator(request.world, request.seed, request.overrides, request.workers, console) as sim:
-        tracks, log = Tracks(), FlightLog(request.out / "flight.log", store_all=request.log_all)
-        stack = build(request.config, request.mission, seed=request.seed)
-        flight = Flight([sim.node, *stack], request.config.lockstep, log=log, listeners=[tracks])
+        with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):
+            _rehearse(sim, request)
         console.print(f"world and kernels ready in {time.perf_counter() - started:.1f} s")
-        started = time.perf_counter()
-        _run(flight, request, tracks, console)
-        wall_s = time.perf_counter() - started
-        log.close()
+        log_file = request.out / "flight.log"
+        with closing(FlightLog(log_file, store_all=request.log_all)) as log:
+            tracks, stack = Tracks(), build(request.config, request.mission, seed=request.seed)
+            flight = Flight([sim.new_node(), *stack], request.config.lockstep, log=log, listeners=[tracks])
+            started = time.perf_counter()
+            _run(flight, request, tracks, console)
+            wall_s = time.perf_counter() - started
         return write_outcome(request, flight, tracks, log, sim, stack, wall_s)
+
+
+def _rehearse(sim: simulation.Simulator, request: Request) -> None:
+    """Fly the first moments with nodes that are thrown away, so that nothing compiles in flight."""
+    stack = build(request.config, request.mission, seed=request.seed)
+    flight = Flight([sim.new_node(), *stack], request.config.lockstep, log=FlightLog(None), listeners=[])
+    for _ in flight.run(limit_s=REHEARSAL_S):
+        pass
+    sim.renderer.cpu_s.update(dict.fromkeys(sim.renderer.cpu_s, 0.0))
 
 
 def _run(flight: Flight, request: Request, tracks: Tracks, console: Console) -> None:

@@ -19,12 +19,16 @@ from sim.world import World, load_world
 
 @dataclass(frozen=True, slots=True)
 class Simulator:
-    """A world with a vehicle in it, as a node."""
+    """A world in which vehicles fly, one at a time."""
 
-    node: SimNode
     world: World
     config: SimConfig
     renderer: Renderer
+    seed: int
+
+    def new_node(self) -> SimNode:
+        """The vehicle at the start, as a node."""
+        return SimNode(self.config, self.world, self.renderer, seed=self.seed)
 
     def scenery(self) -> Scenery:
         """The world as the picture shows it."""
@@ -59,10 +63,9 @@ def open_simulator(
     config = apply_overrides_to(SimConfig(), [o.removeprefix("sim.") for o in overrides if o.startswith("sim.")])
     with console.status(f"building world {world}, seed {seed}"):
         built = load_world(world, seed=seed)
-    with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):
-        kind = WorkerRenderer if workers else InlineRenderer
-        renderer: Renderer = kind(built, config.lidar, config.camera, config.rig, seed=seed)
-        try:
-            yield Simulator(SimNode(config, built, renderer, seed=seed), built, config, renderer)
-        finally:
-            renderer.close()
+    kind = WorkerRenderer if workers else InlineRenderer
+    renderer: Renderer = kind(built, config.lidar, config.camera, config.rig, seed=seed)
+    try:
+        yield Simulator(built, config, renderer, seed)
+    finally:
+        renderer.close()
