@@ -11,16 +11,18 @@ from companion.mission.model import Mission
 from companion.mission.node import MissionNode
 from companion.planning.node import PlanningNode
 from companion.safety.node import SafetyNode
+from companion.sensors.node import SensorsNode
 from companion.tracking.node import TrackingNode
 
 
 def build(config: Config, mission: Mission, *, seed: int) -> list[Node]:
     """All nodes of the stack, ready to be run by `companion.runtime`."""
     return [
+        SensorsNode(config.sensors),
         LioNode(config.estimation, config.rig),
         PropagatorNode(config.estimation),
         GraphNode(config.estimation, config.rig),
-        MappingNode(config.mapping, config.rig),
+        MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m),
         PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),
         TrackingNode(config.tracking),
         MissionNode(mission, config.mission),

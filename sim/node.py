@@ -60,6 +60,7 @@ class SimNode(Node):
         self._autopilot_baro = Baro(config.baro, seed=seed, stream=1)
         self._gps = Gps(config.gps, seed=seed)
         self._range = RangeFinder(config.range_finder, config.rig.range_finder, seed=seed)
+        self._ranged = RangeReading(stamp_ns=0, range_m=math.nan)
         self._command: Array = np.zeros(4)
         self._tick = self._sweeps = self._frames = 0
         self._pieces: tuple[Pending[LidarScan], ...] = ()
@@ -81,14 +82,15 @@ class SimNode(Node):
             yield topics.TRUTH(self._truth(now_ns))
 
     def _sample(self, now_ns: int) -> Outputs:
-        late = self.config.latency
+        late, v = self.config.latency, self.vehicle
         if self._tick % IMU_TICKS == 0:
-            force, rate = self.vehicle.mean_since(now_ns - IMU_TICKS * TICK_NS)
-            sample = self._imu.sample(now_ns, force, rate, self.vehicle.rotor_speed)
+            force, rate = v.mean_since(now_ns - IMU_TICKS * TICK_NS)
+            sample = self._imu.sample(now_ns, force, rate, v.rotor_speed)
             yield topics.IMU(sample, delay_ns=_ns(late.imu_ms))
         if self._tick % SLOW_TICKS == 0:
-            yield topics.BARO(self._baro.sample(now_ns, float(self.vehicle.p_world[2])), delay_ns=_ns(late.baro_ms))
-            yield topics.RANGE(self._ranged(now_ns), delay_ns=_ns(late.range_ms))
+            yield topics.BARO(self._baro.sample(now_ns, float(v.p_world[2])), delay_ns=_ns(late.baro_ms))
+            self._ranged = self._range.sample(now_ns, v.p_world, v.q_world_body, self.world.range_to_surface)
+            yield topics.RANGE(self._ranged, delay_ns=_ns(late.range_ms))
         yield from self._sweep(now_ns, _ns(late.lidar_ms))
         stamp_ns = round((self._frames + 1) * 1e9 / self.config.camera.rate_hz)
         if now_ns >= stamp_ns:
@@ -114,10 +116,6 @@ class SimNode(Node):
         self._frames += 1
         return topics.CAMERA(frame, delay_ns=delay_ns)
 
-    def _ranged(self, now_ns: int) -> RangeReading:
-        v = self.vehicle
-        return self._range.sample(now_ns, v.p_world, v.q_world_body, self.world.range_to_surface)
-
     def _fly(self, now_ns: int) -> Outputs:
         v = self.vehicle
         force, rate = v.mean_since(now_ns - TICK_NS)
@@ -128,7 +126,7 @@ class SimNode(Node):
             imu=(own.angular_velocity_body, own.specific_force_body),
             baro_altitude_m=self._autopilot_baro.sample(now_ns, float(v.p_world[2])).altitude_m if slow else None,
             gps=_fix(self._gps.sample(now_ns, v.p_world, v.v_world)) if gps_due else None,
-            range_m=None,
+            range_m=self._ranged.range_m if slow else None,
             battery_voltage=v.battery_voltage,
         )
         if data := self.autopilot.transmit(now_ns):

@@ -20,14 +20,16 @@ from companion.mapping.node import MappingConfig
 from companion.mission.config import MissionConfig
 from companion.planning.config import PlanningConfig
 from companion.safety.assess import SafetyConfig
+from companion.sensors.guard import SensorsConfig
 from companion.tracking.node import TrackingConfig
 
 DELAY_MS: dict[str, dict[str, float]] = {
     # p95 of the compute time on a 2-core machine, rounded up; see docs/reference/performance.md.
-    "LioNode": {"sensors/lidar": 15.0, "sensors/camera": 3.0},
+    # A camera message often completes the sweep that waited for it: it costs what a sweep does.
+    "LioNode": {"sensors/lidar": 15.0, "sensors/camera": 15.0},
     "GraphNode": {"estimation/likelihood": 8.0},
-    "MappingNode": {"estimation/registered_scan": 25.0},
-    "PlanningNode": {"mapping/local_map": 20.0, "mission/goal": 20.0},
+    "MappingNode": {"estimation/registered_scan": 30.0},
+    "PlanningNode": {"mapping/local_map": 40.0, "mission/goal": 40.0},
 }
 
 
@@ -44,6 +46,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     rig: Rig = Rig()
     hull_radius_m: Annotated[float, msgspec.Meta(gt=0, le=2)] = 0.36
     """Sphere around the body's origin that holds the whole vehicle with its rotors."""
+    sensors: SensorsConfig = SensorsConfig()
     estimation: EstimationConfig = EstimationConfig()
     mapping: MappingConfig = MappingConfig()
     planning: PlanningConfig = PlanningConfig()

@@ -179,25 +179,6 @@ def _settle(octets, lowest, bits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _hit(cells, h, amounts):  # type: ignore[no-untyped-def]
-    """Cell by cell, since hits are few; clears the bits, returns whether a class changed."""
-    step, lowest, highest = i64(amounts[0]), i64(amounts[2]), i64(amounts[3])
-    differ = False
-    for w in range(WORDS):
-        bits = h[w]
-        h[w] = u64(0)
-        if bits == 0:
-            continue
-        for b in range(64):
-            if (bits >> u64(b)) & u64(1):
-                old = i64(cells[64 * w + b])
-                new = min(max((0 if old == UNKNOWN else old) + step, lowest), highest)
-                cells[64 * w + b] = new
-                differ |= old == UNKNOWN or (old >= 0) != (new >= 0)
-    return u8(differ)
-
-
-@njit(cache=True, nogil=True)
 def _at(cells, table, log_odds, found):  # type: ignore[no-untyped-def]
     keys, values = table
     for n in range(cells.shape[0]):

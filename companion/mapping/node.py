@@ -26,7 +26,6 @@ class MappingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     field: FieldConfig = FieldConfig()
     map_every: Annotated[int, msgspec.Meta(ge=1)] = 2  # scans per local map
     own_radius_m: _Metres = 0.35  # returns nearer to the body's origin are the vehicle itself
-    hull_radius_m: _Metres = 0.35  # sphere that is free at each scan: the vehicle fills it
     start_free_radius_m: _Metres = 0.7  # sphere that is free at the first scan: nothing touches the rotors
     start_free_height_m: Annotated[float, msgspec.Meta(ge=0.0, le=10.0)] = 3.0
     """Column of that radius above the start that is free, too: the LiDAR cannot look straight up,
@@ -42,9 +41,10 @@ class MappingNode(Node):
 
     publishes = (LOCAL_MAP,)
 
-    def __init__(self, config: MappingConfig, rig: Rig) -> None:
+    def __init__(self, config: MappingConfig, rig: Rig, *, hull_radius_m: float) -> None:
         self.config = config
         self.rig = rig
+        self.hull_radius_m = hull_radius_m  # a sphere that is free at each scan: the vehicle fills it
         self.voxels = VoxelMap(config.voxels)
         self.scans = self.skipped_pose = self.skipped_stamp = 0
         self._field = DistanceField(config.field, resolution_m=config.voxels.resolution_m)
@@ -79,8 +79,8 @@ class MappingNode(Node):
         """Centres (K, 3) of the cells that are free because the vehicle is, or starts, there."""
         cell_m = self.voxels.resolution_m
         if self.scans > 0:
-            return cells_around(p_odom, radius_m=self.config.hull_radius_m, height_m=0.0, cell_m=cell_m)
-        radius_m = max(self.config.hull_radius_m, self.config.start_free_radius_m)
+            return cells_around(p_odom, radius_m=self.hull_radius_m, height_m=0.0, cell_m=cell_m)
+        radius_m = max(self.hull_radius_m, self.config.start_free_radius_m)
         return cells_around(p_odom, radius_m=radius_m, height_m=self.config.start_free_height_m, cell_m=cell_m)
 
     def _compile(self) -> None:

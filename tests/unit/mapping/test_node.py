@@ -41,7 +41,7 @@ def feed(node, message):
 
 
 def test_every_second_scan_gives_a_local_map_from_the_first_on():
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     maps = [feed(node, scan(k)) for k in range(1, 7)]
     assert [len(m) for m in maps] == [1, 0, 1, 0, 1, 0]
     assert [m[0].stamp_ns for m in maps[::2]] == [1, 3, 5]
@@ -50,14 +50,14 @@ def test_every_second_scan_gives_a_local_map_from_the_first_on():
 
 
 def test_points_land_where_the_pose_puts_them():
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     feed(node, scan(1, [(3.0, 0.1, 0.55)], p=(1.0, 2.1, 0.3), yaw=math.pi / 2, origin=(0.0, 0.1, 0.05)))
     assert node.voxels.classify(np.array([[0.9, 5.1, 0.85], [0.9, 3.5, 0.55]])).tolist() == [2, 1]
     assert len(node.voxels.occupied_centers()) == 1
 
 
 def test_the_start_is_free_where_nothing_was_hit():
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     branch = (0.05, 0.05, 1.52)
     (local,) = feed(node, scan(1, [branch]))
     p = np.array([0.0, 0.0, 0.3])
@@ -73,7 +73,7 @@ def test_the_start_is_free_where_nothing_was_hit():
 
 
 def test_only_the_start_has_a_column_and_the_hull_frees_what_it_fills():
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     feed(node, scan(1))
     feed(node, scan(2, p=(0.0, 6.0, 2.1)))
     offsets = np.array([[0, 0, 0], [0, 0.25, 0], [0, 0, 0.25], [0, -0.6, 0], [0, 0, 1.0]])
@@ -82,19 +82,19 @@ def test_only_the_start_has_a_column_and_the_hull_frees_what_it_fills():
 
 def test_a_start_without_column_trusts_the_lidar_alone():
     config = MappingConfig(voxels=NEARBY.voxels, field=NEARBY.field, start_free_height_m=0.0)
-    node = MappingNode(config, Rig())
+    node = MappingNode(config, Rig(), hull_radius_m=0.35)
     feed(node, scan(1))
     assert node.voxels.classify(np.array([[0.1, 0.1, 0.7], [0.1, 0.1, 1.5]])).tolist() == [1, 0]
 
 
 def test_returns_from_the_own_body_are_no_obstacles():
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     feed(node, scan(1, [(0.2, 0.1, 0.0), (-0.3, 0.0, 0.05), (2.0, 0.0, 0.0)]))
     assert len(node.voxels.occupied_centers()) == 1
 
 
 def test_misses_clear():
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     feed(node, scan(1, [], misses=[(1.0, 0.0, 0.0)]))
     assert node.voxels.classify(np.array([[4.0, 0.0, 0.36], [6.0, 0.0, 0.36]])).tolist() == [1, 0]
 
@@ -110,14 +110,14 @@ def test_misses_clear():
     ],
 )
 def test_scans_without_a_usable_pose_are_left_out_and_counted(change):
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     assert feed(node, dataclasses.replace(scan(5), **change)) == []
     assert (node.skipped_pose, node.scans, node.voxels.block_count) == (1, 0, 0)
     assert len(feed(node, scan(5))) == 1
 
 
 def test_scans_out_of_order_are_left_out_and_counted():
-    node = MappingNode(NEARBY, Rig())
+    node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
     feed(node, scan(5))
     before = node.voxels.to_arrays()["log_odds"].tobytes()
     for stamp_ns in (5, 4):
@@ -131,7 +131,7 @@ def test_two_nodes_fed_alike_publish_the_same_bytes():
     clouds = [rng.normal(size=(500, 3)) * 3 for _ in range(4)]
     runs = []
     for _ in range(2):
-        node = MappingNode(NEARBY, Rig())
+        node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
         maps = [m for k, c in enumerate(clouds) for m in feed(node, scan(k, c, p=(0.3 * k, 0, 1), misses=c[:50]))]
         runs.append(b"".join(m.distance_m.tobytes() + m.unknown_distance_m.tobytes() for m in maps))
     assert runs[0] == runs[1]

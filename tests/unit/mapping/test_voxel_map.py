@@ -123,7 +123,7 @@ def room_scans(rng, count, returns):
 
 def test_classes_agree_with_octomap():
     """Same scans through pyoctomap: at least 99.9 % of all known voxels have the same class."""
-    voxels, tree = small(), OcTree(0.2)
+    voxels, tree = small(sensor=SensorModel(hit=0.7, miss=0.4, lowest=0.12, highest=0.97)), OcTree(0.2)
     for probability, setter in ((0.7, tree.setProbHit), (0.4, tree.setProbMiss)):
         setter(probability)
     tree.setClampingThresMin(0.12)
@@ -205,7 +205,7 @@ def test_beams_without_return_clear_up_to_their_own_range():
     ghost = ORIGIN + np.array([0.0, 3.0, 0.0])
     look(voxels, ghost)
     assert voxels.classify(ghost[None]) == [2]
-    for _ in range(5):
+    for _ in range(STEPS.hit // -STEPS.miss + 1):
         look(voxels, np.empty((0, 3)), misses=np.array([[0.0, 2.0, 0.0]], np.float32))
     assert voxels.classify(ORIGIN + np.array([[0, 3.0, 0], [0, 4.5, 0], [0, 5.5, 0]])).tolist() == [1, 1, 0]
 
