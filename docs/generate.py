@@ -65,7 +65,24 @@ in {summary["wall_s"]:.0f} s, {summary["real_time_factor"]:.2f} x real time (sha
 |---|---|
 {rows}
 | **sum** | **{total:.0f}** |
+
+## Compute time, modelled and measured
+
+In lockstep a node's outputs become visible only after the delay of `lockstep.delay_ms`. The 95th percentile of
+the CPU time of the same flight, compilation included:
+
+| node | on | CPU p95, ms | modelled, ms |
+|---|---|---|---|
+{_delay_rows(summary["compute_p95_ms"])}
 """
+
+
+def _delay_rows(measured: dict[str, dict[str, float]]) -> str:
+    return "\n".join(
+        f"| {node} | `{event}` | {measured[node][event]:.1f} | {modelled:g} |"
+        for node, delays in Config().lockstep.delay_ms.items()
+        for event, modelled in delays.items()
+    )
 
 
 def pages() -> dict[Path, str]:

@@ -17,6 +17,7 @@ from companion.cli import simulation
 from companion.cli.outcome import Outcome, print_outcome, write_outcome
 from companion.config import Config, apply_overrides, load_config
 from companion.core.errors import InputError
+from companion.core.node import Node
 from companion.mission.model import Mission, parse_mission
 from companion.report.tracks import Tracks
 from companion.runtime.flight import Flight
@@ -24,7 +25,7 @@ from companion.runtime.flight import Progress as Where
 from companion.runtime.flight_log import FlightLog
 from companion.stack import build
 
-REHEARSAL_S = 1.6  # standing: a second of rest, then scans and images are registered
+REHEARSAL_S = 3.0  # rest, first scans and images, arming, the beginning of the climb
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,18 +95,25 @@ def fly_request(request: Request, console: Console) -> Outcome:
         console.print(f"world and kernels ready in {time.perf_counter() - started:.1f} s")
         log_file = request.out / "flight.log"
         with closing(FlightLog(log_file, store_all=request.log_all)) as log:
-            tracks, stack = Tracks(), build(request.config, request.mission, seed=request.seed)
-            flight = Flight([sim.new_node(), *stack], request.config.lockstep, log=log, listeners=[tracks])
+            tracks = Tracks()
+            flight, stack = _prepare(sim, request, log, [tracks])
             started = time.perf_counter()
             _run(flight, request, tracks, console)
             wall_s = time.perf_counter() - started
         return write_outcome(request, flight, tracks, log, sim, stack, wall_s)
 
 
-def _rehearse(sim: simulation.Simulator, request: Request) -> None:
-    """Fly the first moments with nodes that are thrown away, so that nothing compiles in flight."""
+def _prepare(
+    sim: simulation.Simulator, request: Request, log: FlightLog, listeners: list[Tracks]
+) -> tuple[Flight, list[Node]]:
+    """A flight at its start, and the nodes of the stack in it."""
     stack = build(request.config, request.mission, seed=request.seed)
-    flight = Flight([sim.new_node(), *stack], request.config.lockstep, log=FlightLog(None), listeners=[])
+    return Flight([sim.new_node(), *stack], request.config.lockstep, log=log, listeners=listeners), stack
+
+
+def _rehearse(sim: simulation.Simulator, request: Request) -> None:
+    """Fly up to the climb with nodes that are thrown away, so that kernels are compiled before the flight."""
+    flight, _ = _prepare(sim, request, FlightLog(None), [])
     for _ in flight.run(limit_s=REHEARSAL_S):
         pass
     sim.renderer.cpu_s.update(dict.fromkeys(sim.renderer.cpu_s, 0.0))

@@ -78,6 +78,7 @@ def _summary(
         wall_s=wall_s,
         real_time_factor=figures["duration_s"] / max(wall_s, 1e-9),
         cpu_s=cpu_s,
+        compute_p95_ms=flight.lockstep.compute_ms(95),
         dropped={k: v for k, v in flight.lockstep.dropped.items() if v},
         messages=sum(log.counts.values()),
         flight_hash=log.flight_hash,

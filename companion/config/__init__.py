@@ -24,7 +24,7 @@ from companion.sensors.guard import SensorsConfig
 from companion.tracking.node import TrackingConfig
 
 DELAY_MS: dict[str, dict[str, float]] = {
-    # p95 of the compute time on a 2-core machine, rounded up; see docs/reference/performance.md.
+    # Above 1.4 times the p95 that docs/reference/performance.md shows: machines differ.
     # A camera message often completes the sweep that waited for it: it costs what a sweep does.
     "LioNode": {"sensors/lidar": 15.0, "sensors/camera": 15.0},
     "GraphNode": {"estimation/likelihood": 8.0},

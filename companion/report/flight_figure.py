@@ -75,7 +75,7 @@ def _from_above(figure: Figure, axes: Axes, tracks: Tracks, scenery: Scenery, es
         axes.plot(*truth.p[-1, :2], "s", ms=7, mfc=style.VERMILION, mec=style.BLACK, label="landing", zorder=7)
     axes.set(xlim=box[0], ylim=box[1], aspect="equal", xlabel="east, m", ylabel="north, m", title="From above")
     figure.colorbar(lines, ax=axes, label="estimate's distance to the truth, cm", shrink=0.6, pad=0.01)
-    axes.legend(loc="upper left", ncols=5, frameon=True, framealpha=0.9, edgecolor="none", borderpad=0.3)
+    _legend_above(axes)
     style.north_arrow(axes)
     style.scale_bar(axes, 10.0)
 
@@ -148,7 +148,12 @@ def _error_over_time(axes: Axes, tracks: Tracks, estimate: Track, truth: Track) 
         limit = max(3.0, 130 * float(np.abs(error).max()))
         axes.set_ylim(-limit, limit)
     axes.set(xlabel="time, s", ylabel="error, cm", title="Estimate minus truth")
-    axes.legend(loc="upper left", ncols=4)
+    _legend_above(axes)
+
+
+def _legend_above(axes: Axes) -> None:
+    """Beside the title, where it hides no data."""
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=6, frameon=False, borderpad=0.0)
 
 
 def _frame(p: Array, *, margin: float) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -41,6 +41,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
     real_time_factor: float
     cpu_s: dict[str, float]
+    compute_p95_ms: dict[str, dict[str, float]]  # CPU per node and event, where a delay is modelled
     dropped: dict[str, int]
     messages: int
     flight_hash: str

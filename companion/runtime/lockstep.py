@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from time import thread_time
 from typing import Any, Protocol
 
+import numpy as np
+
 from companion.core.messages import freeze
 from companion.core.node import Node, Output, Topic
 
@@ -47,6 +49,7 @@ class _Seat:
     waiting: deque[_Event] = field(default_factory=deque)
     waking: bool = False
     cpu_s: float = 0.0
+    taken_s: dict[str, list[float]] = field(default_factory=dict)  # per event that gave outputs
     dropped: int = 0
 
 
@@ -70,6 +73,14 @@ class Lockstep:
     def cpu_s(self) -> dict[str, float]:
         """CPU seconds of this thread per node."""
         return {name(seat.node): seat.cpu_s for seat in self._seats}
+
+    def compute_ms(self, percent: float) -> dict[str, dict[str, float]]:
+        """Percentile of the CPU time per node and event with a modelled delay, of those that gave outputs."""
+        return {
+            name(seat.node): {e: float(np.percentile(t, percent)) * 1e3 for e, t in seat.taken_s.items()}
+            for seat in self._seats
+            if seat.taken_s
+        }
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -123,7 +134,10 @@ class Lockstep:
             outputs = list(seat.node.tick(event.name, self.now_ns))
         else:
             outputs = list(seat.node.handle(event.topic, event.message))
-        seat.cpu_s += thread_time() - started
+        taken_s = thread_time() - started
+        seat.cpu_s += taken_s
+        if outputs and event.name in seat.delays_ns:
+            seat.taken_s.setdefault(event.name, []).append(taken_s)
         delay_ns = seat.delays_ns.get(event.name, 0) if outputs else 0
         seat.busy_until_ns = self.now_ns + delay_ns
         for output in outputs:

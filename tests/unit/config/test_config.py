@@ -163,7 +163,10 @@ def test_delays_are_set_by_node_and_topic():
     ("override", "message"),
     [
         ("mission.hold=5", "mission.hold: unknown key, did you mean hold_s? (valid: ready_timeout_s,"),
-        ("misson.hold_s=5", "misson: unknown key, did you mean mission? (valid: rig, hull_radius_m, sensors, estimation"),
+        (
+            "misson.hold_s=5",
+            "misson: unknown key, did you mean mission? (valid: rig, hull_radius_m, sensors, estimation",
+        ),
         ("mission.hold_s=-5", "mission.hold_s: -5 is out of range (valid: a number > 0 in s)"),
         ("mission.hold_s=5 s", "mission.hold_s: '5 s' is not a number"),
         ("mission.hold_s=", "mission.hold_s: has no value"),

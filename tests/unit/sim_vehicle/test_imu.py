@@ -12,7 +12,7 @@ from sim.sensors.imu import Imu, ImuConfig, load_vibration
 
 REST = np.array([0.0, 0.0, 9.80665])
 QUIET = msgspec.structs.replace(load_vibration(), isolation=0.0)
-DATA = Path("/work/shared/data/imu_rtk_quadrotor_ansfl")
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "imu_rtk_quadrotor_ansfl"
 
 
 def record(config: ImuConfig, count: int, *, rotor: float = 0.0, seed: int = 1, stream: int = 0) -> np.ndarray:
