@@ -102,7 +102,11 @@ def print_outcome(outcome: Outcome, console: Console, *, as_json: bool) -> None:
     if as_json:
         typer.echo(to_json(outcome.summary))
         return
-    s = outcome.summary
+    console.print(outcome_table(outcome.summary, outcome.picture))
+
+
+def outcome_table(s: Summary, picture: Path) -> Table:
+    """What a flight came to, label and text."""
     table = Table(show_header=False, box=None, pad_edge=False)
     rows = {
         "completed": "[green]yes[/]" if s.completed else f"[red]no[/]: {s.reason}",
@@ -114,11 +118,11 @@ def print_outcome(outcome: Outcome, console: Console, *, as_json: bool) -> None:
         "speed of simulation": f"{s.real_time_factor:.2f} x real time, {s.wall_s:.1f} s",
         "CPU per simulated s": _largest(s),
         "flight hash": s.flight_hash[:16],
-        "picture": str(outcome.picture),
+        "picture": str(picture),
     }
     for label, text in rows.items():
         table.add_row(f"[bold]{label}[/]", text)
-    console.print(table)
+    return table
 
 
 def _largest(summary: Summary) -> str:
