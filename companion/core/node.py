@@ -27,6 +27,17 @@ class Pending(Protocol[M_co]):
         ...
 
 
+@dataclass(frozen=True)
+class Done(Generic[M_co]):
+    """A result that is there."""
+
+    value: M_co
+
+    def result(self) -> M_co:
+        """The value."""
+        return self.value
+
+
 @dataclass(frozen=True, slots=True)
 class Output:
     """One message, or a promise of one, on its way out of a node."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar, cast
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 
 from companion.core.messages import Array, CameraImage, LidarScan
-from companion.core.node import Pending
+from companion.core.node import Done, Pending
 from companion.core.rig import Rig
 from sim.sensors.camera import CameraConfig
 from sim.sensors.lidar import LidarConfig
@@ -24,7 +24,6 @@ from sim.sensors.worker import RenderError, Worker
 from sim.world.model import World
 
 __all__ = ["InlineRenderer", "RenderError", "Renderer", "WorkerRenderer"]
-M = TypeVar("M")
 
 
 class Renderer(Protocol):
@@ -47,17 +46,6 @@ class Renderer(Protocol):
 
     def close(self) -> None:
         """Free what the renderer holds."""
-
-
-@dataclass(frozen=True)
-class Done(Generic[M]):
-    """A result that is there."""
-
-    value: M
-
-    def result(self) -> M:
-        """The value."""
-        return self.value
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,10 @@
 """The laws of simulated time: order, modelled delay, busy nodes, determinism."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
 from companion.core.messages import BaroReading, RangeReading
 from companion.core.node import Node, Outputs, Topic, every, on
 from companion.runtime.codec import decode, encode
@@ -109,6 +114,53 @@ def test_the_log_holds_every_message_and_the_hash_repeats(tmp_path):
     messages = [e for e in read_log(tmp_path / "a") if e[0] == 0]
     assert len(messages) == sum(a.counts.values())
     assert decode(messages[0][4], RangeReading).stamp_ns == 0
+
+
+class Moody(Node):
+    """Answers every third message, and takes its time on the clock."""
+
+    def __init__(self, wait_s: float) -> None:
+        self.wait_s, self.count = wait_s, 0
+
+    @on(FAST)
+    def fast(self, msg: RangeReading) -> Outputs:
+        self.count += 1
+        time.sleep(self.wait_s)
+        if self.count % 3 == 0:
+            yield OUT(msg)
+
+    @on(SLOW)
+    def slow(self, msg: BaroReading) -> Outputs:
+        yield OUT(RangeReading(stamp_ns=msg.stamp_ns, range_m=float(self.count)))
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.002])
+@pytest.mark.parametrize("delay_ms", [3, 10, 25])
+def test_threads_change_neither_messages_nor_deliveries(wait_s, delay_ms):
+    def fly(executor):
+        tap = Recorder()
+        delays = {"Moody": {"fast": delay_ms * MS, "slow": 2 * MS}, "Worker": {"slow": delay_ms * MS}}
+        nodes = [Source(), Moody(wait_s), Worker(), Sink()]
+        step = Lockstep(nodes, delays_ns=delays, tap=tap, executor=executor)
+        step.run_until(300 * MS)
+        step.settle()
+        return tap.messages, tap.deliveries, step.dropped, nodes[1].count
+
+    with ThreadPoolExecutor(2) as executor:
+        assert fly(executor) == fly(None)
+
+
+class Broken(Node):
+    @on(SLOW)
+    def slow(self, msg: BaroReading) -> Outputs:
+        raise ValueError(f"altitude {msg.altitude_m}")
+
+
+def test_what_a_node_raises_in_a_thread_is_raised_by_the_run():
+    with ThreadPoolExecutor(1) as executor:
+        step = Lockstep([Source(), Broken()], delays_ns={"Broken": {"slow": MS}}, tap=Recorder(), executor=executor)
+        with pytest.raises(ValueError, match=r"altitude 2\.0"):
+            step.run_until(100 * MS)
 
 
 def test_a_torn_log_reads_up_to_the_tear(tmp_path):
