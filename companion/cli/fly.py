@@ -54,7 +54,9 @@ def fly(
     ] = None,
     config: Annotated[Path | None, typer.Option(help="Configuration YAML; holds only differences.")] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder [flights/<date>-<mission>].")] = None,
-    cores: Annotated[int, typer.Option(min=1, max=2, help="2 casts rays in a second process and runs nodes in a second thread.")] = 2,
+    cores: Annotated[
+        int, typer.Option(min=1, max=2, help="2 casts rays in a second process and runs nodes in a second thread.")
+    ] = 2,
     limit_s: Annotated[float, typer.Option(min=1, help="Simulated seconds after which to give up.")] = 900.0,
     log_all: Annotated[bool, typer.Option(help="Store raw scans, images and maps in the log, too.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,

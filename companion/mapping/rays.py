@@ -97,66 +97,93 @@ class RayGrid:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cast(vectors, pose, ranges, bits, row, strides):  # type: ignore[no-untyped-def]
     """One pass over the rays; all lengths in voxels, except `near` in the unit of `vectors`."""
-    R, offset, start = pose
-    near, far, miss = ranges
+    start = pose[2]
     free, hit, reached = bits
-    ox, oy, oz = start[0], start[1], start[2]
-    ix, iy, iz = int(ox), int(oy), int(oz)
-    x_stride = (u32(strides[0, 0]), u32(strides[1, 0]))
-    y_stride = (u32(strides[0, 1]), u32(strides[1, 1]))
-    z_stride = (u32(strides[0, 2]), u32(strides[1, 2]))
-    lx, ly, lz = min(reached[0, 0], ix), min(reached[0, 1], iy), min(reached[0, 2], iz)
-    hx, hy, hz = max(reached[1, 0], ix), max(reached[1, 1], iy), max(reached[1, 2], iz)
+    cell = (int(start[0]), int(start[1]), int(start[2]))
     used = steps = end = 0
     for i in range(vectors.shape[0]):
-        a, b, c = np.float64(vectors[i, 0]), np.float64(vectors[i, 1]), np.float64(vectors[i, 2])
-        dx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + offset[0]
-        dy = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + offset[1]
-        dz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + offset[2]
-        length2 = dx * dx + dy * dy + dz * dz
-        if not (0.0 < length2 < 1e18) or a * a + b * b + c * c < near * near:  # NaN fails, too
+        counts, cut, d = _ray(vectors[i], pose, ranges)
+        if not counts:
             continue
         used += 1
-        cut = miss or length2 > far * far
-        if cut:
-            shrink = far / math.sqrt(length2)
-            dx, dy, dz = dx * shrink, dy * shrink, dz * shrink
-        jx, jy, jz = int(ox + dx), int(oy + dy), int(oz + dz)
-        lx, ly, lz = min(lx, jx), min(ly, jy), min(lz, jz)
-        hx, hy, hz = max(hx, jx), max(hy, jy), max(hz, jz)
+        last = (int(start[0] + d[0]), int(start[1] + d[1]), int(start[2] + d[2]))
+        _reach(reached, last)
         if not cut:
-            _set_bit(hit, _index(jx, jy, jz, strides))
-            _set_bit(free, _index(jx, jy, jz, strides))
-        nx, ny, nz = abs(jx - ix), abs(jy - iy), abs(jz - iz)  # planes crossed
-        gx, gy, gz = 1.0 / abs(dx), 1.0 / abs(dy), 1.0 / abs(dz)  # of the ray, from plane to plane
-        sx, tx = (1, (ix + 1 - ox) * gx) if dx > 0 else (-1, (ox - ix) * gx)  # of the ray, to the first
-        sy, ty = (1, (iy + 1 - oy) * gy) if dy > 0 else (-1, (oy - iy) * gy)
-        sz, tz = (1, (iz + 1 - oz) * gz) if dz > 0 else (-1, (oz - iz) * gz)
-        if cut and nx + ny + nz > 0:  # OctoMap's choice: the voxel of the cut is not seen
-            last_x = tx + (nx - 1) * gx if nx > 0 else -1.0
-            last_y = ty + (ny - 1) * gy if ny > 0 else -1.0
-            last_z = tz + (nz - 1) * gz if nz > 0 else -1.0
-            if last_x >= last_y and last_x >= last_z:
-                nx -= 1
-            elif last_y >= last_z:
-                ny -= 1
-            else:
-                nz -= 1
-        _family(row, end, (nx, ix + sx, sx, x_stride), (tx, gx), (oy, dy, y_stride), (oz, dz, z_stride))
-        end += nx
-        _family(row, end, (ny, iy + sy, sy, y_stride), (ty, gy), (ox, dx, x_stride), (oz, dz, z_stride))
-        end += ny
-        _family(row, end, (nz, iz + sz, sz, z_stride), (tz, gz), (ox, dx, x_stride), (oy, dy, y_stride))
-        end += nz
+            index = _index(last[0], last[1], last[2], strides)
+            _set_bit(hit, index)
+            _set_bit(free, index)
+        end = _crossed(row, end, ((start[0], start[1], start[2]), cell, last, d, cut), strides)
         if end > _BATCH:
             steps += _set_bits(free, row[:end])
             end = 0
     steps += _set_bits(free, row[:end])
     if used > 0:
-        _set_bit(free, _index(ix, iy, iz, strides))
-    reached[0, 0], reached[0, 1], reached[0, 2] = lx, ly, lz
-    reached[1, 0], reached[1, 1], reached[1, 2] = hx, hy, hz
+        _reach(reached, cell)
+        _set_bit(free, _index(cell[0], cell[1], cell[2], strides))
     return used, steps
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ray(vector, pose, ranges):  # type: ignore[no-untyped-def]
+    """Whether a ray counts, whether it ends without a hit, and its way in voxels, at most `far` long."""
+    R, offset, _ = pose
+    near, far, miss = ranges
+    a, b, c = np.float64(vector[0]), np.float64(vector[1]), np.float64(vector[2])
+    dx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + offset[0]
+    dy = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + offset[1]
+    dz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + offset[2]
+    length2 = dx * dx + dy * dy + dz * dz
+    counts = 0.0 < length2 < 1e18 and a * a + b * b + c * c >= near * near  # NaN fails, too
+    cut = miss or length2 > far * far
+    shrink = far / math.sqrt(length2) if cut else 1.0
+    return counts, cut, (dx * shrink, dy * shrink, dz * shrink)
+
+
+@njit(cache=True, nogil=True)
+def _reach(reached, cell):  # type: ignore[no-untyped-def]
+    for k in range(3):
+        reached[0, k] = min(reached[0, k], cell[k])
+        reached[1, k] = max(reached[1, k], cell[k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _crossed(row, end, ray, strides):  # type: ignore[no-untyped-def]
+    """Write the voxels that a ray enters behind the first `end` indices; returns the new end."""
+    (ox, oy, oz), (ix, iy, iz), (jx, jy, jz), (dx, dy, dz), cut = ray
+    x_stride = (u32(strides[0, 0]), u32(strides[1, 0]))
+    y_stride = (u32(strides[0, 1]), u32(strides[1, 1]))
+    z_stride = (u32(strides[0, 2]), u32(strides[1, 2]))
+    nx, ny, nz = abs(jx - ix), abs(jy - iy), abs(jz - iz)  # planes crossed
+    (sx, tx, gx), (sy, ty, gy), (sz, tz, gz) = _planes(ox, ix, dx), _planes(oy, iy, dy), _planes(oz, iz, dz)
+    if cut and nx + ny + nz > 0:  # OctoMap's choice: the voxel of the cut is not seen
+        nx, ny, nz = _without_last((nx, ny, nz), (tx, ty, tz), (gx, gy, gz))
+    _family(row, end, (nx, ix + sx, sx, x_stride), (tx, gx), (oy, dy, y_stride), (oz, dz, z_stride))
+    end += nx
+    _family(row, end, (ny, iy + sy, sy, y_stride), (ty, gy), (ox, dx, x_stride), (oz, dz, z_stride))
+    end += ny
+    _family(row, end, (nz, iz + sz, sz, z_stride), (tz, gz), (ox, dx, x_stride), (oy, dy, y_stride))
+    return end + nz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _planes(o, i, d):  # type: ignore[no-untyped-def]
+    """Of one axis: direction, share of the ray to its first plane, share from plane to plane."""
+    gap = 1.0 / abs(d)
+    return (1, (i + 1 - o) * gap, gap) if d > 0 else (-1, (o - i) * gap, gap)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _without_last(counts, first, gaps):  # type: ignore[no-untyped-def]
+    """Planes per axis less the one that is crossed last."""
+    nx, ny, nz = counts
+    last_x = first[0] + (nx - 1) * gaps[0] if nx > 0 else -1.0
+    last_y = first[1] + (ny - 1) * gaps[1] if ny > 0 else -1.0
+    last_z = first[2] + (nz - 1) * gaps[2] if nz > 0 else -1.0
+    if last_x >= last_y and last_x >= last_z:
+        return nx - 1, ny, nz
+    if last_y >= last_z:
+        return nx, ny - 1, nz
+    return nx, ny, nz - 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
