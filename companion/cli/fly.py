@@ -54,9 +54,7 @@ def fly(
     ] = None,
     config: Annotated[Path | None, typer.Option(help="Configuration YAML; holds only differences.")] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder [flights/<date>-<mission>].")] = None,
-    cores: Annotated[
-        int, typer.Option(min=1, max=2, help="2 casts rays in a second process and runs nodes in a second thread.")
-    ] = 2,
+    cores: Annotated[int, typer.Option(min=1, max=2, help="2 casts rays in a second process.")] = 2,
     limit_s: Annotated[float, typer.Option(min=1, help="Simulated seconds after which to give up.")] = 900.0,
     log_all: Annotated[bool, typer.Option(help="Store raw scans, images and maps in the log, too.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
@@ -110,9 +108,7 @@ def _prepare(
 ) -> tuple[Flight, list[Node]]:
     """A flight at its start, and the nodes of the stack in it."""
     stack = build(request.config, request.mission, seed=request.seed)
-    nodes = [sim.new_node(), *stack]
-    lockstep, threads = request.config.lockstep, request.workers
-    return Flight(nodes, lockstep, log=log, listeners=listeners, threads=threads), stack
+    return Flight([sim.new_node(), *stack], request.config.lockstep, log=log, listeners=listeners), stack
 
 
 def _rehearse(sim: simulation.Simulator, request: Request) -> None:

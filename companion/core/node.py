@@ -26,16 +26,9 @@ class Pending(Protocol[M_co]):
         """The message, waiting for it if it must."""
         ...
 
-
-@dataclass(frozen=True)
-class Done(Generic[M_co]):
-    """A result that is there."""
-
-    value: M_co
-
-    def result(self) -> M_co:
-        """The value."""
-        return self.value
+    def ready(self) -> bool:
+        """Whether `result` would not wait."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -46,19 +45,11 @@ class Flight:
     """Nodes in lockstep; iterate `run` for progress, then ask `ending`."""
 
     def __init__(
-        self,
-        nodes: Sequence[Node],
-        config: LockstepConfig,
-        *,
-        log: FlightLog,
-        listeners: Sequence[Listener],
-        threads: int = 0,
+        self, nodes: Sequence[Node], config: LockstepConfig, *, log: FlightLog, listeners: Sequence[Listener]
     ) -> None:
-        """`threads` compute what is not due yet, beside the caller's; the bytes are the same."""
         delays_ns = {n: {k: round(v * 1e6) for k, v in d.items()} for n, d in config.delay_ms.items()}
         self._tee = _Tee(log, [self, *listeners])
-        self._executor = ThreadPoolExecutor(threads, "understory-nodes") if threads else None
-        self.lockstep = Lockstep(nodes, delays_ns=delays_ns, tap=self._tee, executor=self._executor)
+        self.lockstep = Lockstep(nodes, delays_ns=delays_ns, tap=self._tee)
         self._truth: GroundTruth | None = None
         self._mission: MissionStatus | None = None
         self._touched = ""
@@ -78,9 +69,7 @@ class Flight:
                 self.lockstep.run_until(self.lockstep.now_ns + STEP_NS)
                 yield Progress(self.lockstep.now_ns * 1e-9, self._truth, self._mission)
         finally:
-            if self._executor is not None:
-                self._executor.shutdown()
-                self.lockstep.settle()
+            self.lockstep.settle()
 
     def ending(self, *, limit_s: float) -> Ending:
         """What came out of it."""

@@ -6,8 +6,9 @@ handles, its outputs become visible only then, and what arrives meanwhile waits 
 `keep="latest"`, replaces what waits). Nothing flies on zero-latency perception.
 
 The same delay is what a second core can use: what a node computes is not needed before its
-outputs become visible, so with an executor it is computed meanwhile, and waited for then, or
-when its next message must know whether it is busy. Order and bytes are those of one thread.
+outputs become visible, so it is put off until then, or until its next message must know whether
+it is busy, or until there is time because a sensor is still rendered elsewhere. Order and bytes
+do not depend on when it is computed.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
 from time import thread_time
@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from companion.core.messages import freeze
-from companion.core.node import Done, Node, Output, Pending, Topic
+from companion.core.node import Node, Output, Pending, Topic
 
 
 class Tap(Protocol):
@@ -47,11 +47,11 @@ class _Event:
 
 @dataclass(slots=True, eq=False)
 class _Job:
-    """What a node does with one event, maybe still being computed."""
+    """What a node makes of one event, computed when it is first asked for."""
 
     event: _Event
     fed_ns: int
-    outcome: Pending[tuple[list[Output], float]]  # outputs, CPU seconds
+    outputs: list[Output] | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -63,28 +63,18 @@ class _Seat:
     busy_until_ns: int = 0
     waiting: deque[_Event] = field(default_factory=deque)
     waking: bool = False
-    job: _Job | None = None  # the newest, if its result was not looked at
+    job: _Job | None = None  # the newest, if it was not looked at
     cpu_s: float = 0.0
     taken_s: dict[str, list[float]] = field(default_factory=dict)  # per event that gave outputs
     dropped: int = 0
 
 
 class Lockstep:
-    """Runs nodes; `delays_ns` maps node name -> {topic or timer name -> modelled compute time}.
+    """Runs nodes; `delays_ns` maps node name -> {topic or timer name -> modelled compute time}."""
 
-    `executor`: where events with a delay are computed; None: in the calling thread.
-    """
-
-    def __init__(
-        self,
-        nodes: Sequence[Node],
-        *,
-        delays_ns: Mapping[str, Mapping[str, int]],
-        tap: Tap,
-        executor: Executor | None = None,
-    ) -> None:
+    def __init__(self, nodes: Sequence[Node], *, delays_ns: Mapping[str, Mapping[str, int]], tap: Tap) -> None:
         self.now_ns = 0
-        self._tap, self._executor = tap, executor
+        self._tap = tap
         self._sequence = 0
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._seats = [_Seat(n, delays_ns.get(name(n), {})) for n in nodes]
@@ -125,7 +115,7 @@ class Lockstep:
         self.now_ns = end_ns
 
     def settle(self) -> None:
-        """Wait for what is still being computed: then the nodes may be looked at."""
+        """Compute what was put off: then the nodes may be looked at."""
         for seat in self._seats:
             self._settle(seat)
 
@@ -160,35 +150,33 @@ class Lockstep:
 
     def _feed(self, seat: _Seat, event: _Event) -> None:
         self._tap.fed(self.now_ns, name(seat.node), event.name, event.number)
-        delay_ns = seat.delays_ns.get(event.name, 0)
-        if delay_ns and self._executor is not None:
-            outcome: Any = self._executor.submit(_computed, seat.node, event, self.now_ns)
-        else:
-            outcome = Done(_computed(seat.node, event, self.now_ns))
-        seat.job = job = _Job(event, self.now_ns, outcome)
-        if delay_ns:
+        seat.job = job = _Job(event, self.now_ns)
+        if delay_ns := seat.delays_ns.get(event.name, 0):
             self._at(self.now_ns + delay_ns, partial(self._publish, seat, job))
         else:
-            self._settle(seat)
             self._publish(seat, job)
 
     def _settle(self, seat: _Seat) -> None:
-        """Know how the newest job came out: one without outputs took no time."""
-        if seat.job is None:
+        """Compute the newest job if that was put off; one without outputs takes no simulated time."""
+        job, seat.job = seat.job, None
+        if job is None:
             return
-        event, fed_ns = seat.job.event, seat.job.fed_ns
-        outputs, taken_s = seat.job.outcome.result()
-        seat.job = None
+        started, event = thread_time(), job.event
+        if event.topic is None:
+            job.outputs = list(seat.node.tick(event.name, job.fed_ns))
+        else:
+            job.outputs = list(seat.node.handle(event.topic, event.message))
+        taken_s = thread_time() - started
         seat.cpu_s += taken_s
-        seat.busy_until_ns = fed_ns
-        if outputs and event.name in seat.delays_ns:
+        seat.busy_until_ns = job.fed_ns
+        if job.outputs and event.name in seat.delays_ns:
             seat.taken_s.setdefault(event.name, []).append(taken_s)
             seat.busy_until_ns += seat.delays_ns[event.name]
 
     def _publish(self, seat: _Seat, job: _Job) -> None:
         if seat.job is job:
             self._settle(seat)
-        for output in job.outcome.result()[0]:
+        for output in job.outputs or ():
             if output.delay_ns:
                 self._at(self.now_ns + output.delay_ns, partial(self._deliver, name(seat.node), output))
             else:
@@ -197,6 +185,7 @@ class Lockstep:
     def _deliver(self, source: str, output: Output) -> None:
         message = output.message
         if hasattr(message, "result"):
+            self._use_the_wait(message)
             message = message.result()
         freeze(message)
         number = self._tap.published(self.now_ns, source, output.topic, message)
@@ -204,19 +193,20 @@ class Lockstep:
             event = _Event(output.topic.name, output.topic, message, number)
             self._at(self.now_ns, partial(self._arrive, seat, event))
 
+    def _use_the_wait(self, message: Pending[Any]) -> None:
+        """Compute what was put off, oldest first, while a message is not ready."""
+        for seat in sorted((s for s in self._seats if s.job), key=_fed_ns):
+            if message.ready():
+                return
+            self._settle(seat)
+
     def _at(self, time_ns: int, act: Callable[[], None]) -> None:
         self._sequence += 1
         heapq.heappush(self._queue, (time_ns, self._sequence, act))
 
 
-def _computed(node: Node, event: _Event, now_ns: int) -> tuple[list[Output], float]:
-    """What a node makes of an event, and the CPU seconds of this thread that it took."""
-    started = thread_time()
-    if event.topic is None:
-        outputs = list(node.tick(event.name, now_ns))
-    else:
-        outputs = list(node.handle(event.topic, event.message))
-    return outputs, thread_time() - started
+def _fed_ns(seat: _Seat) -> int:
+    return seat.job.fed_ns if seat.job else 0
 
 
 def name(node: Node) -> str:

@@ -10,12 +10,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Protocol, Self, cast
+from typing import Any, Generic, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
 from companion.core.messages import Array, CameraImage, LidarScan
-from companion.core.node import Done, Pending
+from companion.core.node import Pending
 from companion.core.rig import Rig
 from sim.sensors.camera import CameraConfig
 from sim.sensors.lidar import LidarConfig
@@ -24,6 +24,7 @@ from sim.sensors.worker import RenderError, Worker
 from sim.world.model import World
 
 __all__ = ["InlineRenderer", "RenderError", "Renderer", "WorkerRenderer"]
+M = TypeVar("M")
 
 
 class Renderer(Protocol):
@@ -49,6 +50,21 @@ class Renderer(Protocol):
 
 
 @dataclass(frozen=True)
+class Done(Generic[M]):
+    """A result that is there."""
+
+    value: M
+
+    def result(self) -> M:
+        """The value."""
+        return self.value
+
+    def ready(self) -> bool:
+        """Always."""
+        return True
+
+
+@dataclass(frozen=True)
 class JoinedSweep:
     """A sweep whose pieces were submitted while it went on, so that a worker keeps pace with it."""
 
@@ -64,6 +80,10 @@ class JoinedSweep:
             miss_dirs_sensor=np.concatenate([s.miss_dirs_sensor for s in scans]),
             miss_age_s=np.concatenate([s.miss_age_s for s in scans]),
         )
+
+    def ready(self) -> bool:
+        """Whether the last piece is there: they are served in order."""
+        return self.pieces[-1].ready()
 
 
 class _Base(ABC):

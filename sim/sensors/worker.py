@@ -33,7 +33,7 @@ class _Job:
     """A promised message."""
 
     kind: str
-    fetch: Callable[[_Job], None]
+    fetch: Callable[..., None]
     slot: int
     value: Any = None
     error: str = ""
@@ -45,6 +45,12 @@ class _Job:
         if self.error:
             raise RenderError(self.error)
         return self.value
+
+    def ready(self) -> bool:
+        """Whether `result` would not wait."""
+        if self.value is None and not self.error:
+            self.fetch(self, wait=False)
+        return self.value is not None or bool(self.error)
 
 
 class Worker:
@@ -101,22 +107,25 @@ class Worker:
         self._shared.close()
         self._shared.unlink()
 
-    def _fetch(self, job: _Job) -> None:
-        """Take results, in order, until `job` has its own."""
+    def _fetch(self, job: _Job, *, wait: bool = True) -> None:
+        """Take results, in order, until `job` has its own, or until there are no more."""
         try:
             self.wait_ready()
-            while job.value is None and not job.error:
-                answer = self._receive()
-                done = self._waiting.popleft()
-                self._free.append(done.slot)
-                if isinstance(answer, str):
-                    done.error = answer
-                else:
-                    header, cpu_s = answer
-                    self._cpu_s[done.kind] += cpu_s
-                    done.value = _read(done.kind, header, self._buffer, done.slot * self._slot_bytes)
-        except RenderError as error:
+            while job.value is None and not job.error and (wait or self._conn.poll()):
+                self._hand_out(self._receive())
+        except (RenderError, OSError) as error:
             self._fail_all(str(error))
+
+    def _hand_out(self, answer: Any) -> None:
+        """An answer is the result of the oldest request."""
+        done = self._waiting.popleft()
+        self._free.append(done.slot)
+        if isinstance(answer, str):
+            done.error = answer
+            return
+        header, cpu_s = answer
+        self._cpu_s[done.kind] += cpu_s
+        done.value = _read(done.kind, header, self._buffer, done.slot * self._slot_bytes)
 
     def _receive(self) -> Any:
         try:

@@ -1,8 +1,5 @@
 """The laws of simulated time: order, modelled delay, busy nodes, determinism."""
 
-import time
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 
 from companion.core.messages import BaroReading, RangeReading
@@ -116,38 +113,77 @@ def test_the_log_holds_every_message_and_the_hash_repeats(tmp_path):
     assert decode(messages[0][4], RangeReading).stamp_ns == 0
 
 
-class Moody(Node):
-    """Answers every third message, and takes its time on the clock."""
+class Camera(Node):
+    """Publishes promises; `slow_to_come`: they are not ready when they are due."""
 
-    def __init__(self, wait_s: float) -> None:
-        self.wait_s, self.count = wait_s, 0
+    def __init__(self, slow_to_come: bool) -> None:
+        self.slow_to_come = slow_to_come
+
+    @every(hz=40)
+    def frame(self, now_ns: int) -> Outputs:
+        yield FAST(Promise(RangeReading(stamp_ns=now_ns, range_m=3.0), not self.slow_to_come), delay_ns=5 * MS)
+
+
+class Promise:
+    def __init__(self, value: RangeReading, ready: bool) -> None:
+        self.value, self._ready = value, ready
+
+    def result(self) -> RangeReading:
+        return self.value
+
+    def ready(self) -> bool:
+        return self._ready
+
+
+class Moody(Node):
+    """Answers every third message."""
+
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
 
     @on(FAST)
     def fast(self, msg: RangeReading) -> Outputs:
-        self.count += 1
-        time.sleep(self.wait_s)
-        if self.count % 3 == 0:
+        self.stamps.append(msg.stamp_ns)
+        if len(self.stamps) % 3 == 0:
             yield OUT(msg)
 
     @on(SLOW)
     def slow(self, msg: BaroReading) -> Outputs:
-        yield OUT(RangeReading(stamp_ns=msg.stamp_ns, range_m=float(self.count)))
+        yield OUT(RangeReading(stamp_ns=msg.stamp_ns, range_m=float(len(self.stamps))))
 
 
-@pytest.mark.parametrize("wait_s", [0.0, 0.002])
 @pytest.mark.parametrize("delay_ms", [3, 10, 25])
-def test_threads_change_neither_messages_nor_deliveries(wait_s, delay_ms):
-    def fly(executor):
-        tap = Recorder()
-        delays = {"Moody": {"fast": delay_ms * MS, "slow": 2 * MS}, "Worker": {"slow": delay_ms * MS}}
-        nodes = [Source(), Moody(wait_s), Worker(), Sink()]
-        step = Lockstep(nodes, delays_ns=delays, tap=tap, executor=executor)
+def test_when_something_is_computed_changes_neither_messages_nor_deliveries(delay_ms):
+    def fly(slow_to_come):
+        tap, moody = Recorder(), Moody()
+        delays = {"Moody": {"fast": delay_ms * MS, "slow": 7 * MS}, "Worker": {"slow": delay_ms * MS}}
+        step = Lockstep([Source(), Camera(slow_to_come), moody, Worker(), Sink()], delays_ns=delays, tap=tap)
         step.run_until(300 * MS)
         step.settle()
-        return tap.messages, tap.deliveries, step.dropped, nodes[1].count
+        return tap.messages, tap.deliveries, step.dropped, moody.stamps
 
-    with ThreadPoolExecutor(2) as executor:
-        assert fly(executor) == fly(None)
+    assert fly(slow_to_come=True) == fly(slow_to_come=False)
+
+
+class Counter(Node):
+    def __init__(self) -> None:
+        self.count = 0
+
+    @on(SLOW)
+    def slow(self, msg: BaroReading) -> Outputs:
+        self.count += 1
+        yield OUT(RangeReading(stamp_ns=msg.stamp_ns, range_m=0.0))
+
+
+def test_the_wait_for_a_sensor_is_used_for_what_was_put_off():
+    def computed_by(end_ms, slow_to_come):
+        counter, delays = Counter(), {"Counter": {"slow": 40 * MS}}
+        step = Lockstep([Source(), Camera(slow_to_come), counter], delays_ns=delays, tap=Recorder())
+        step.run_until(end_ms * MS)
+        return counter.count
+
+    assert [computed_by(4, True), computed_by(6, True)] == [0, 1]  # heard at 3 ms, the camera is due at 5 ms
+    assert [computed_by(22, False), computed_by(44, False)] == [0, 1]  # known when the next one comes, at 23 ms
 
 
 class Broken(Node):
@@ -156,11 +192,10 @@ class Broken(Node):
         raise ValueError(f"altitude {msg.altitude_m}")
 
 
-def test_what_a_node_raises_in_a_thread_is_raised_by_the_run():
-    with ThreadPoolExecutor(1) as executor:
-        step = Lockstep([Source(), Broken()], delays_ns={"Broken": {"slow": MS}}, tap=Recorder(), executor=executor)
-        with pytest.raises(ValueError, match=r"altitude 2\.0"):
-            step.run_until(100 * MS)
+def test_what_a_node_raises_is_raised_by_the_run():
+    step = Lockstep([Source(), Broken()], delays_ns={"Broken": {"slow": MS}}, tap=Recorder())
+    with pytest.raises(ValueError, match=r"altitude 2\.0"):
+        step.run_until(100 * MS)
 
 
 def test_a_torn_log_reads_up_to_the_tear(tmp_path):
