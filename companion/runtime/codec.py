@@ -13,6 +13,12 @@ def encode(message: Any) -> bytes:
     return _encoder.encode(message)
 
 
+def encode_into(message: Any, buffer: bytearray) -> bytearray:
+    """`encode` into memory that is there: for what is many megabytes, many times a second."""
+    _encoder.encode_into(message, buffer)
+    return buffer
+
+
 def decode(data: bytes, kind: type[Any]) -> Any:
     """Inverse of `encode`; arrays come back read-only."""
     if kind not in _decoders:

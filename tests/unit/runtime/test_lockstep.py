@@ -183,7 +183,7 @@ def test_the_wait_for_a_sensor_is_used_for_what_was_put_off():
         return counter.count
 
     assert [computed_by(4, True), computed_by(6, True)] == [0, 1]  # heard at 3 ms, the camera is due at 5 ms
-    assert [computed_by(22, False), computed_by(44, False)] == [0, 1]  # known when the next one comes, at 23 ms
+    assert [computed_by(22, False), computed_by(24, False)] == [0, 1]  # known when the next one comes, at 23 ms
 
 
 class Broken(Node):
