@@ -33,8 +33,8 @@ def topics_page() -> str:
 
 In the order of the data flow; messages are in `companion/core/messages.py`.
 
-| topic | message | rate, Hz | a busy node gets | stored in the log | stale after, s |
-|---|---|---|---|---|---|
+| topic | message | ROS 2 type | rate, Hz | service | a busy node gets | stored in the log | stale after, s |
+|---|---|---|---|---|---|---|---|
 {rows}
 """
 
@@ -43,7 +43,8 @@ def _topic_row(t: topics.Topic[Any]) -> str:
     rate = f"{t.rate_hz:g}" if t.rate_hz else "on change"
     stored = "yes" if t.recorded else "digest"
     stale = "" if t.deadline_s is None else f"{t.deadline_s:g}"
-    return f"| `{t.name}` | `{t.type.__name__}` | {rate} | {t.keep} | {stored} | {stale} |"
+    name, ros = t.type.__name__, t.ros_type
+    return f"| `{t.name}` | `{name}` | `{ros}` | {rate} | {t.service} | {t.keep} | {stored} | {stale} |"
 
 
 def config_page() -> str:

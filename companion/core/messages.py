@@ -167,6 +167,15 @@ class LocalMap:
     ground_z_odom: Array32  # lowest ground seen per column, NaN: none, (X, Y)
 
 
+@message
+class MapStatus:
+    """How old and how large the map is: for whoever needs no cells."""
+
+    stamp_ns: int  # of the newest scan inside the newest local map
+    scans: int  # taken in so far
+    blocks: int  # of 8 x 8 x 8 voxels, alive
+
+
 # --- mission ------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ M_co = TypeVar("M_co", covariant=True)
 N = TypeVar("N", bound="Node")
 
 Keep = Literal["all", "latest"]
+Service = Literal["control", "state", "bulk", "latched"]
 
 
 class Pending(Protocol[M_co]):
@@ -46,7 +47,9 @@ class Topic(Generic[M]):
 
     `rate_hz` is the expected rate (0: on change); a periodic topic is stale when it was
     silent for `deadline_s`. `keep` says whether a busy subscriber gets every message or
-    only the newest; `recorded` whether the flight log stores it.
+    only the newest; `recorded` whether the flight log stores it. `service` is how a bus treats
+    it: `control` before all else, `state`, `bulk` behind the others, `latched` for late joiners.
+    `ros_type` is the standard ROS 2 type that carries it; if none fits without loss, our own.
     """
 
     name: str
@@ -55,7 +58,12 @@ class Topic(Generic[M]):
     keep: Keep = "latest"
     recorded: bool = True
     deadline_s: float | None = None
+    service: Service = field(default="state", kw_only=True)
     ros_type: str = field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not self.ros_type:
+            object.__setattr__(self, "ros_type", f"understory_msgs/msg/{self.type.__name__}")
 
     def __call__(self, message: M | Pending[M], *, delay_ns: int = 0) -> Output:
         """Wrap a message for publication."""

@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 
 from companion.core.geometry import rotation_from_quaternion
-from companion.core.messages import Array, RegisteredScan
+from companion.core.messages import Array, MapStatus, RegisteredScan
 from companion.core.node import Node, Outputs, on
 from companion.core.rig import Rig
-from companion.core.topics import LOCAL_MAP, REGISTERED
+from companion.core.topics import LOCAL_MAP, MAP_STATUS, REGISTERED
 from companion.mapping.distance_field import DistanceField, FieldConfig
 from companion.mapping.free_volume import cells_around
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
@@ -39,7 +39,7 @@ class MappingNode(Node):
     count scans that were left out: pose not finite, stamp not newer than the last.
     """
 
-    publishes = (LOCAL_MAP,)
+    publishes = (LOCAL_MAP, MAP_STATUS)
 
     def __init__(self, config: MappingConfig, rig: Rig, *, hull_radius_m: float) -> None:
         self.config = config
@@ -73,6 +73,7 @@ class MappingNode(Node):
         )
         if self.scans % self.config.map_every == 0:
             yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
+            yield MAP_STATUS(MapStatus(stamp_ns=scan.stamp_ns, scans=self.scans + 1, blocks=self.voxels.block_count))
         self.scans += 1
 
     def _filled_by_vehicle(self, p_odom: Array) -> Array:

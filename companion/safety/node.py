@@ -12,7 +12,7 @@ from companion.core.geometry import rotate
 from companion.core.messages import (
     Array,
     LioState,
-    LocalMap,
+    MapStatus,
     Odometry,
     SafetyStatus,
     SmoothedState,
@@ -58,8 +58,8 @@ class SafetyNode(Node):
         if message.source == "lidar":
             self._lidar_ns = message.stamp_ns
 
-    @on(topics.LOCAL_MAP)
-    def _take_map(self, message: LocalMap) -> None:
+    @on(topics.MAP_STATUS)
+    def _take_map(self, message: MapStatus) -> None:
         self._map_ns = message.stamp_ns
 
     @every(hz=20)

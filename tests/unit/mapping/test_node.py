@@ -9,7 +9,7 @@ import pytest
 from companion.core.geometry import quaternion_from_yaw
 from companion.core.messages import RegisteredScan, freeze
 from companion.core.rig import Rig
-from companion.core.topics import LOCAL_MAP, REGISTERED
+from companion.core.topics import LOCAL_MAP, MAP_STATUS, REGISTERED
 from companion.mapping.distance_field import FieldConfig
 from companion.mapping.free_volume import cells_around
 from companion.mapping.node import MappingConfig, MappingNode
@@ -34,10 +34,12 @@ def scan(stamp_ns, points=((5.0, 0.0, 0.0),), *, p=(0.0, 0.0, 0.3), yaw=0.0, mis
 
 
 def feed(node, message):
-    """What the node publishes because of one scan."""
+    """The maps that the node publishes because of one scan; each comes with its status."""
     outputs = list(node.handle(REGISTERED, message))
-    assert all(o.topic is LOCAL_MAP for o in outputs)
-    return [o.message for o in outputs]
+    maps = [o.message for o in outputs if o.topic is LOCAL_MAP]
+    statuses = [o.message for o in outputs if o.topic is MAP_STATUS]
+    assert [(s.stamp_ns, s.scans) for s in statuses] == [(m.stamp_ns, node.scans) for m in maps]
+    return maps
 
 
 def test_every_second_scan_gives_a_local_map_from_the_first_on():

@@ -117,11 +117,7 @@ class Guarded:
                 inlier_fraction=0.9, weakest_direction=0.3,
             )))  # fmt: skip
         if "map" in self.on:
-            cell = np.zeros((1, 1, 1), np.float32)
-            sent.append((topics.LOCAL_MAP, m.LocalMap(
-                stamp_ns=now, origin_odom=zero, resolution_m=0.2, state=cell.astype(np.uint8),
-                distance_m=cell, unknown_distance_m=cell, ground_z_odom=cell[0],
-            )))  # fmt: skip
+            sent.append((topics.MAP_STATUS, m.MapStatus(stamp_ns=now, scans=1, blocks=1)))
         sent.append((topics.VEHICLE, m.VehicleStatus(
             stamp_ns=now, connected=True, armed=self.armed, mode="OFFBOARD", landed=self.landed, ready=True,
             battery_fraction=0.9, p_odom=zero, v_odom=zero, text="",
