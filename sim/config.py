@@ -34,6 +34,8 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """The simulated aircraft and its surroundings."""
 
     start_yaw_deg: float = 0.0
+    open_sky: bool = False  # the autopilot has compass and GPS: it flies without a companion, too
+    render: bool = True  # LiDAR and camera; without them less is computed
     rig: Rig = Rig()  # where the sensors truly sit; the stack has its own calibration
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()

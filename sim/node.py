@@ -8,14 +8,16 @@ autopilot decides the next commands.
 from __future__ import annotations
 
 import math
+from typing import Final
 
+import msgspec
 import numpy as np
 
 from companion.core import topics
 from companion.core.messages import Array, GroundTruth, LidarScan, MavlinkBytes, RangeReading
-from companion.core.node import Node, Output, Outputs, Pending, every, on
+from companion.core.node import Node, Outputs, Pending, every, on
 from sim.autopilot.autopilot import Autopilot
-from sim.autopilot.readings import Airframe
+from sim.autopilot.readings import Airframe, AutopilotConfig
 from sim.autopilot.readings import GpsFix as ReceiverFix
 from sim.config import SimConfig
 from sim.sensors.baro import Baro
@@ -30,6 +32,7 @@ from sim.world import World
 TICK_NS = 2_500_000  # 400 Hz
 PHYSICS_STEPS = 2
 PIECES = 5  # of a sweep, so that a render worker keeps pace with it
+OPEN_SKY: Final = {"EKF2_GPS_CTRL": 7.0, "SYS_HAS_GPS": 1.0}  # parameters
 IMU_TICKS, TRUTH_TICKS, SLOW_TICKS, GPS_TICKS = 2, 8, 20, 80  # 200, 50, 20 and 5 Hz
 
 
@@ -51,7 +54,7 @@ class SimNode(Node):
             wind=config.wind,
             seed=seed,
         )
-        self.autopilot = Autopilot(config.autopilot, airframe=_airframe(params), seed=seed)
+        self.autopilot = Autopilot(_autopilot(config), airframe=_airframe(params), seed=seed)
         self._renderer = renderer
         hover = params.hover_speed_rad_s
         self._imu = Imu(config.imu, seed=seed, hover_speed_rad_s=hover)
@@ -64,6 +67,7 @@ class SimNode(Node):
         self._command: Array = np.zeros(4)
         self._tick = self._sweeps = self._frames = 0
         self._pieces: tuple[Pending[LidarScan], ...] = ()
+        self.left_out = {"lidar": 0, "camera": 0}  # sweeps and frames for which the renderer was too busy
 
     @on(topics.MAVLINK_TX)
     def receive(self, msg: MavlinkBytes) -> None:
@@ -94,13 +98,17 @@ class SimNode(Node):
         yield from self._sweep(now_ns, _ns(late.lidar_ms))
         stamp_ns = round((self._frames + 1) * 1e9 / self.config.camera.rate_hz)
         if now_ns >= stamp_ns:
-            yield self._frame(stamp_ns, _ns(late.camera_ms) + stamp_ns - now_ns)
+            yield from self._frame(stamp_ns, _ns(late.camera_ms) + stamp_ns - now_ns)
 
     def _sweep(self, now_ns: int, delay_ns: int) -> Outputs:
         """Submit the piece of the sweep that has just ended; publish the sweep after its last."""
         sweep_ns = round(1e9 / self.config.lidar.rate_hz)
         stamp_ns, part = (self._sweeps + 1) * sweep_ns, len(self._pieces)
         if now_ns < stamp_ns - sweep_ns + (part + 1) * sweep_ns // PIECES:
+            return
+        if part == 0 and self._renderer.busy:
+            self._sweeps += 1
+            self.left_out["lidar"] += 1
             return
         knots = knot_stamps(self.config.lidar, stamp_ns, 21, part=part, parts=PIECES)
         p, q = self.vehicle.poses_at(knots)
@@ -110,11 +118,14 @@ class SimNode(Node):
             yield topics.LIDAR(JoinedSweep(self._pieces), delay_ns=delay_ns + stamp_ns - now_ns)
             self._sweeps, self._pieces = self._sweeps + 1, ()
 
-    def _frame(self, stamp_ns: int, delay_ns: int) -> Output:
-        p, q = self.vehicle.poses_at(np.array([stamp_ns]))
-        frame = self._renderer.submit_camera(p[0], q[0], stamp_ns=stamp_ns, counter=self._frames)
+    def _frame(self, stamp_ns: int, delay_ns: int) -> Outputs:
         self._frames += 1
-        return topics.CAMERA(frame, delay_ns=delay_ns)
+        if self._renderer.busy:
+            self.left_out["camera"] += 1
+            return
+        p, q = self.vehicle.poses_at(np.array([stamp_ns]))
+        frame = self._renderer.submit_camera(p[0], q[0], stamp_ns=stamp_ns, counter=self._frames - 1)
+        yield topics.CAMERA(frame, delay_ns=delay_ns)
 
     def _fly(self, now_ns: int) -> Outputs:
         v = self.vehicle
@@ -149,6 +160,15 @@ class SimNode(Node):
 
 def _ns(milliseconds: float) -> int:
     return round(milliseconds * 1e6)
+
+
+def _autopilot(config: SimConfig) -> AutopilotConfig:
+    """What its owner set; under an open sky the compass gave it the heading, and it fuses GPS."""
+    own = config.autopilot
+    if not config.open_sky:
+        return own
+    heading = 90.0 - config.start_yaw_deg if own.boot_heading_deg is None else own.boot_heading_deg
+    return msgspec.structs.replace(own, boot_heading_deg=heading, parameters={**OPEN_SKY, **own.parameters})
 
 
 def _obstacles(world: World) -> Obstacles:

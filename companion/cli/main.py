@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 import companion
-from companion.cli import config, doctor, fly, mavlink, mission, odometry
+from companion.cli import config, doctor, fly, mavlink, mission, odometry, sim
 from companion.core.errors import CompanionError
 
 app = typer.Typer(
@@ -18,6 +18,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("fly")(fly.fly)
+app.command("sim")(sim.sim)
 app.command("doctor")(doctor.doctor)
 app.command("odometry")(odometry.odometry)
 

@@ -13,7 +13,7 @@ from companion.config import apply_overrides_to, dump_struct
 from companion.report.flight_figure import Scenery
 from sim.config import SimConfig
 from sim.node import SimNode
-from sim.sensors.render import InlineRenderer, Renderer, WorkerRenderer
+from sim.sensors.render import InlineRenderer, NoRenderer, Renderer, WorkerRenderer
 from sim.world import World, load_world
 
 
@@ -57,15 +57,32 @@ class Simulator:
 
 @contextmanager
 def open_simulator(
-    world: str, seed: int, overrides: Sequence[str], workers: int, console: Console
+    world: str,
+    seed: int,
+    overrides: Sequence[str],
+    workers: int,
+    console: Console,
+    *,
+    most_waiting: int | None = None,
 ) -> Iterator[Simulator]:
-    """Build world and renderer, warm both up, and close what was opened."""
+    """Build world and renderer, warm both up, and close what was opened.
+
+    A worker that is `most_waiting` requests behind leaves sweeps and frames out.
+    """
     config = apply_overrides_to(SimConfig(), [o.removeprefix("sim.") for o in overrides if o.startswith("sim.")])
     with console.status(f"building world {world}, seed {seed}"):
         built = load_world(world, seed=seed)
-    kind = WorkerRenderer if workers else InlineRenderer
-    renderer: Renderer = kind(built, config.lidar, config.camera, config.rig, seed=seed)
+    renderer = _renderer(config, built, seed, workers=workers, most_waiting=most_waiting)
     try:
         yield Simulator(built, config, renderer, seed)
     finally:
         renderer.close()
+
+
+def _renderer(config: SimConfig, world: World, seed: int, *, workers: int, most_waiting: int | None) -> Renderer:
+    if not config.render:
+        return NoRenderer()
+    sensors = config.lidar, config.camera, config.rig
+    if not workers:
+        return InlineRenderer(world, *sensors, seed=seed)
+    return WorkerRenderer(world, *sensors, seed=seed, most_waiting=most_waiting)

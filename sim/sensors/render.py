@@ -23,7 +23,7 @@ from sim.sensors.scene import RenderSetup, Sensors
 from sim.sensors.worker import RenderError, Worker
 from sim.world.model import World
 
-__all__ = ["InlineRenderer", "RenderError", "Renderer", "WorkerRenderer"]
+__all__ = ["InlineRenderer", "NoRenderer", "RenderError", "Renderer", "WorkerRenderer"]
 M = TypeVar("M")
 
 
@@ -31,6 +31,10 @@ class Renderer(Protocol):
     """What the simulator's sensors ask for."""
 
     cpu_s: dict[str, float]  # CPU seconds spent on "lidar" and "camera" so far, wherever
+
+    @property
+    def busy(self) -> bool:
+        """Whether a sweep or frame should rather be left out now, as a driver on a slow computer does."""
 
     def submit_lidar(
         self, p_world: Array, q_world_body: Array, *, stamp_ns: int, counter: int, **options: float
@@ -127,6 +131,11 @@ class InlineRenderer(_Base):
         self._sensors = Sensors(RenderSetup(world.mesh, lidar, camera, rig, seed))
         self._sensors.warm()
 
+    @property
+    def busy(self) -> bool:
+        """Never: a request is served before the next can come."""
+        return False
+
     def _submit(self, kind: str, request: dict[str, Any]) -> Pending[Any]:
         message, cpu_s = self._sensors.render(kind, request)
         self.cpu_s[kind] += cpu_s
@@ -142,16 +151,32 @@ class WorkerRenderer(_Base):
     A script that uses it must guard its entry with `if __name__ == "__main__"`, as every
     spawned process demands. The worker compiles while its parent goes on; `wait_ready`
     waits for it. It ends by itself when its parent is gone. `result` raises RenderError with
-    the worker's own traceback.
+    the worker's own traceback. It is `busy` while `most_waiting` requests are unserved; without
+    that number it never is, and nothing is left out.
     """
 
-    def __init__(self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int) -> None:
+    def __init__(
+        self,
+        world: World,
+        lidar: LidarConfig,
+        camera: CameraConfig,
+        rig: Rig,
+        *,
+        seed: int,
+        most_waiting: int | None = None,
+    ) -> None:
         self.cpu_s = {"lidar": 0.0, "camera": 0.0}
+        self._most_waiting = most_waiting
         self._worker = Worker(RenderSetup(world.mesh, lidar, camera, rig, seed), self.cpu_s)
 
     def wait_ready(self) -> None:
         """Block until the worker has built and compiled everything; raises RenderError."""
         self._worker.wait_ready()
+
+    @property
+    def busy(self) -> bool:
+        """Whether the worker is behind by `most_waiting` requests."""
+        return self._most_waiting is not None and self._worker.waiting() >= self._most_waiting
 
     def _submit(self, kind: str, request: dict[str, Any]) -> Pending[Any]:
         return self._worker.submit(kind, request)
@@ -159,3 +184,18 @@ class WorkerRenderer(_Base):
     def close(self) -> None:
         """End the worker and free its memory; results not fetched fail with RenderError."""
         self._worker.close()
+
+
+class NoRenderer(_Base):
+    """A vehicle without LiDAR and camera: always busy, so nothing is ever asked of it."""
+
+    busy = True
+
+    def __init__(self) -> None:
+        self.cpu_s: dict[str, float] = {}
+
+    def _submit(self, kind: str, request: dict[str, Any]) -> Pending[Any]:
+        raise RenderError(f"this vehicle has no {kind}")
+
+    def close(self) -> None:
+        """Nothing to end."""

@@ -79,6 +79,12 @@ class Worker:
                 raise RenderError(error)
             self._ready = True
 
+    def waiting(self) -> int:
+        """Requests without a result so far."""
+        if self._waiting:
+            self._fetch(self._waiting[-1], wait=False)
+        return len(self._waiting)
+
     def submit(self, kind: str, request: dict[str, Any]) -> _Job:
         """Queue a request; waits only if all slots are taken by results that nobody fetched."""
         if self._closed:
