@@ -43,7 +43,10 @@ class SimNode(Node):
         topics.IMU, topics.LIDAR, topics.CAMERA, topics.RANGE, topics.BARO, topics.MAVLINK_RX, topics.TRUTH,
     )  # fmt: skip
 
-    def __init__(self, config: SimConfig, world: World, renderer: Renderer, *, seed: int) -> None:
+    def __init__(
+        self, config: SimConfig, world: World, renderer: Renderer, *, seed: int, signing_key: bytes | None = None
+    ) -> None:
+        """`signing_key`: the autopilot's MAVLink key, 32 bytes; None: it neither signs nor checks."""
         self.config, self.world = config, world
         params = load_params()
         self.vehicle = Vehicle(
@@ -54,7 +57,7 @@ class SimNode(Node):
             wind=config.wind,
             seed=seed,
         )
-        self.autopilot = Autopilot(_autopilot(config), airframe=_airframe(params), seed=seed)
+        self.autopilot = Autopilot(_autopilot(config), airframe=_airframe(params), seed=seed, signing_key=signing_key)
         self._renderer = renderer
         hover = params.hover_speed_rad_s
         self._imu = Imu(config.imu, seed=seed, hover_speed_rad_s=hover)

@@ -18,7 +18,8 @@ from typing import Any, Final, NamedTuple
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
-from companion.autopilot.wire import CRC_EXTRA, MAGIC_V2, Frame
+from companion.autopilot.signing import Signing
+from companion.autopilot.wire import CRC_EXTRA, MAGIC_V2, SIGNED_FLAG, Frame
 
 Floats = tuple[float, ...]
 
@@ -148,6 +149,15 @@ class Odometry(NamedTuple):
     quality: int
 
 
+class StatusText(NamedTuple):
+    """STATUSTEXT, id 253, to send; what comes is decoded by pymavlink's class."""
+
+    severity: int
+    text: bytes
+    id: int = 0
+    chunk_seq: int = 0
+
+
 HotMessage = (
     Heartbeat
     | AttitudeQuaternion
@@ -157,6 +167,7 @@ HotMessage = (
     | HighresImu
     | Timesync
     | Odometry
+    | StatusText
 )
 
 _LAYOUTS: Final[dict[type[Any], tuple[int, struct.Struct]]] = {
@@ -168,6 +179,7 @@ _LAYOUTS: Final[dict[type[Any], tuple[int, struct.Struct]]] = {
     HighresImu: (105, struct.Struct("<Q13fHB")),
     Timesync: (111, struct.Struct("<qq")),
     Odometry: (331, struct.Struct("<Q55fBBBBb")),
+    StatusText: (253, struct.Struct("<B50sHB")),
 }
 
 
@@ -204,7 +216,7 @@ def _decode_odometry(payload: bytes) -> Odometry:
 
 
 _FAST: Final[dict[int, Callable[[bytes], Any]]] = {
-    **{msg_id: _flat(cls) for cls, (msg_id, _) in _LAYOUTS.items()},
+    **{msg_id: _flat(cls) for cls, (msg_id, _) in _LAYOUTS.items() if cls is not StatusText},
     31: _decode_attitude,
     331: _decode_odometry,
 }
@@ -232,27 +244,27 @@ def _decode_other(frame: Frame) -> Any:
 
 
 class Encoder:
-    """Packs MAVLink 2 frames from one sender with its own sequence numbers."""
+    """Packs MAVLink 2 frames from one sender with its own sequence numbers; signs them if it can."""
 
-    def __init__(self, *, system: int, component: int) -> None:
-        self._system, self._component = system, component
-        self._sequence = 0
+    def __init__(self, *, system: int, component: int, signing: Signing | None = None) -> None:
+        self._system, self._component, self._signing = system, component, signing
+        self.sequence = 0  # of the next frame
 
-    def encode(self, message: HotMessage) -> bytes:
-        """The frame of a message of this file."""
+    def encode(self, message: HotMessage, now_ns: int = 0) -> bytes:
+        """The frame of a message of this file; `now_ns` matters to signatures only."""
         msg_id, layout = _LAYOUTS[type(message)]
-        return self.frame(msg_id, layout.pack(*_flatten(message)))
+        return self.frame(msg_id, layout.pack(*_flatten(message)), now_ns)
 
-    def frame(self, msg_id: int, payload: bytes) -> bytes:
-        """Header, payload without trailing zeros (one byte stays) and CRC."""
+    def frame(self, msg_id: int, payload: bytes, now_ns: int = 0) -> bytes:
+        """Header, payload without trailing zeros (one byte stays), CRC and signature."""
         payload = payload.rstrip(b"\0") or payload[:1]
-        body = _HEADER.pack(
-            len(payload), 0, 0, self._sequence, self._system, self._component, msg_id & 0xFFFF, msg_id >> 16
-        )
-        self._sequence = (self._sequence + 1) & 0xFF
-        body += payload
+        flags = SIGNED_FLAG if self._signing else 0
+        low, high = msg_id & 0xFFFF, msg_id >> 16
+        body = _HEADER.pack(len(payload), flags, 0, self.sequence, self._system, self._component, low, high) + payload
+        self.sequence = (self.sequence + 1) & 0xFF
         crc = mcrf4xx(body + bytes([CRC_EXTRA[msg_id]]))
-        return _MAGIC + body + crc.to_bytes(2, "little")
+        frame = _MAGIC + body + crc.to_bytes(2, "little")
+        return frame + self._signing.signature(frame, now_ns) if self._signing else frame
 
 
 _HEADER = struct.Struct("<BBBBBBHB")

@@ -13,6 +13,8 @@ from typing import Final, Literal, NamedTuple
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
+from companion.autopilot.signing import Signing
+
 MAGIC_V1: Final = 0xFE
 MAGIC_V2: Final = 0xFD
 SIGNED_FLAG: Final = 0x01
@@ -50,7 +52,7 @@ class Frame(NamedTuple):
     system: int
     component: int
     sequence: int
-    signed: bool  # carries a signature; it is not verified
+    signed: bool  # carries a signature; a Parser with a key has verified it
     known: bool  # the id is in the table, so the CRC proves the frame
     payload: bytes
     size: int  # bytes of the whole frame
@@ -110,8 +112,12 @@ class Parser:
     depend on how the stream was cut into pieces.
     """
 
-    def __init__(self, wanted: Collection[int] | None = None) -> None:
-        """Return only frames with these ids (None: all); the others are checked and counted."""
+    def __init__(self, wanted: Collection[int] | None = None, *, signing: Signing | None = None) -> None:
+        """Return only frames with these ids (None: all); the others are checked and counted.
+
+        With `signing`, a frame that it does not accept is as if it had not come.
+        """
+        self._signing = signing
         self._wanted = None if wanted is None else frozenset(wanted)
         self._rest = b""
         self._in_damage = False
@@ -121,17 +127,19 @@ class Parser:
         self.corrupt_pieces = 0
         self.skipped_bytes = 0
 
-    def feed(self, data: bytes) -> list[Frame]:
-        """All wanted frames that `data` completes, in order."""
+    def feed(self, data: bytes, now_ns: int = 0) -> list[Frame]:
+        """All wanted frames that `data` completes, in order; `now_ns` matters to signatures only."""
         if self._rest:
             data = self._rest + data
         found: list[Frame] = []
+        signing = self._signing
         at, size = 0, len(data)
         while at < size:
             frame = read_frame(data, at)
             if isinstance(frame, Frame):
                 self._count(frame)
-                if self._wanted is None or frame.msg_id in self._wanted:
+                wanted = self._wanted is None or frame.msg_id in self._wanted
+                if (signing is None or signing.accepts(data[at : at + frame.size], now_ns)) and wanted:
                     found.append(frame)
                 at += frame.size
             elif frame == "bad":

@@ -27,6 +27,7 @@ from sim.autopilot.mission_store import MissionStore
 from sim.autopilot.modes import Severity
 from sim.autopilot.params import Parameters, ParameterService, airframe_defaults
 from sim.autopilot.readings import Airframe, AutopilotConfig, GpsFix
+from sim.autopilot.signing import Signing
 from sim.autopilot.streams import Streams
 from sim.autopilot.telemetry import Clock, Readings, Telemetry
 from sim.autopilot.timesync import TimeSync
@@ -39,14 +40,19 @@ TEXT_BYTES = 50
 class Autopilot:
     """Estimator, cascade, commander and protocol in one state machine; see the module's text."""
 
-    def __init__(self, config: AutopilotConfig, *, airframe: Airframe, seed: int) -> None:
+    def __init__(
+        self, config: AutopilotConfig, *, airframe: Airframe, seed: int, signing_key: bytes | None = None
+    ) -> None:
+        """With a `signing_key` of 32 bytes it signs what it says and hears only who holds the key."""
         own = {"MAV_SYS_ID": config.system_id, "BAT1_N_CELLS": config.battery_cells}
         self.parameters = Parameters(airframe_defaults(airframe), own, config.parameters)
         self._offset_ns = round(config.boot_offset_s * 1e9)
         heading = None if config.boot_heading_deg is None else math.radians(config.boot_heading_deg)
         rng = np.random.default_rng([seed, 0xA0])
         self._clock, self._readings = Clock(), Readings()
-        self._encoder, self._parser = Encoder(system=config.system_id, component=1), Parser()
+        self.signing = None if signing_key is None else Signing(signing_key)
+        self._encoder = Encoder(system=config.system_id, component=1, signing=self.signing)
+        self._parser = Parser(signing=self.signing)
         self.estimator = Estimator(self.parameters, boot_heading=heading)
         self.controller = Controller(self.parameters, airframe)
         self.commander = Commander(self.parameters, self.estimator, self.controller, say=self._say)
@@ -132,6 +138,8 @@ class Autopilot:
     def _tell_time(self, now_ns: int) -> None:
         self._clock.ns = now_ns + self._offset_ns
         self.commander.now_ns = self._clock.ns
+        if self.signing is not None:
+            self.signing.now_ns = self._clock.ns
 
     def _take_fix(self, fix: GpsFix) -> None:
         self._readings.gps = fix

@@ -17,6 +17,8 @@ from typing import Any, Final, NamedTuple
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
+from sim.autopilot.signing import SIGNED, Signing
+
 
 class Layout(NamedTuple):
     """One message type on the wire."""
@@ -53,10 +55,11 @@ _START = re.compile(b"[\xfd\xfe]")
 
 
 class Encoder:
-    """Packs the messages of one sender and counts their sequence."""
+    """Packs the messages of one sender, counts their sequence, signs them if it has a key."""
 
-    def __init__(self, *, system: int, component: int) -> None:
+    def __init__(self, *, system: int, component: int, signing: Signing | None = None) -> None:
         self._system, self._component, self._sequence = system, component, 0
+        self._signing, self._flags = signing, SIGNED if signing else 0
 
     def __call__(self, layout: Layout, *values: Any) -> bytes:
         """One whole frame; raises struct.error if a value does not fit its field."""
@@ -64,10 +67,13 @@ class Encoder:
         sequence, msg_id = self._sequence, layout.msg_id
         self._sequence = (sequence + 1) & 0xFF
         body = (
-            _HEAD.pack(len(payload), 0, 0, sequence, self._system, self._component, msg_id & 0xFFFF, msg_id >> 16)
+            _HEAD.pack(
+                len(payload), self._flags, 0, sequence, self._system, self._component, msg_id & 0xFFFF, msg_id >> 16
+            )
             + payload
         )
-        return b"\xfd" + body + mcrf4xx(body + layout.seed).to_bytes(2, "little")
+        frame = b"\xfd" + body + mcrf4xx(body + layout.seed).to_bytes(2, "little")
+        return frame + self._signing.tail(frame) if self._signing else frame
 
 
 class Frame(NamedTuple):
@@ -88,10 +94,12 @@ class Parser:
     """Finds frames of version 1 and 2 in a stream of bytes cut anywhere; never raises.
 
     Damaged bytes are skipped to the next possible start. Frames of unknown types, or with
-    incompatibility flags other than "signed", are passed over. Signatures are not verified.
+    incompatibility flags other than "signed", are passed over. With `signing`, frames that it
+    refuses are as if they had not come; without, signatures are not looked at.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, signing: Signing | None = None) -> None:
+        self._signing = signing
         self._rest = b""
         self.damaged = 0  # bytes at which no frame started
 
@@ -110,7 +118,8 @@ class Parser:
                 start = _START.search(data, at + 1)
                 at = start.start() if start else size
             else:
-                found.append(frame)
+                if self._signing is None or self._signing.accepts(data[at : at + length]):
+                    found.append(frame)
                 at += length
         self._rest = data[at:]
         return found
