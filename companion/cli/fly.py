@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from companion.cli import simulation
 from companion.cli.outcome import Outcome, print_outcome, write_outcome
-from companion.config import Config, apply_overrides, load_config
+from companion.config import Config, apply_overrides, dump_config, load_config
 from companion.core.errors import InputError
 from companion.core.node import Node
 from companion.mission.model import Mission, parse_mission
@@ -23,6 +23,8 @@ from companion.report.tracks import Tracks
 from companion.runtime.flight import Flight
 from companion.runtime.flight import Progress as Where
 from companion.runtime.flight_log import FlightLog
+from companion.runtime.lockstep import name
+from companion.runtime.log_file import Header
 from companion.stack import build
 
 REHEARSAL_S = 3.0  # rest, first scans and images, arming, the beginning of the climb
@@ -42,6 +44,7 @@ class Request:
     workers: int
     limit_s: float
     log_all: bool
+    record: bool = False
 
 
 def fly(
@@ -57,6 +60,9 @@ def fly(
     cores: Annotated[int, typer.Option(min=1, max=2, help="2 casts rays in a second process.")] = 2,
     limit_s: Annotated[float, typer.Option(min=1, help="Simulated seconds after which to give up.")] = 900.0,
     log_all: Annotated[bool, typer.Option(help="Store raw scans, images and maps in the log, too.")] = False,
+    record: Annotated[
+        bool, typer.Option(help="Store raw scans and images for `companion replay`: 3 MB per flown second.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
@@ -77,6 +83,7 @@ def fly(
         workers=cores - 1,
         limit_s=limit_s,
         log_all=log_all,
+        record=record,
     )
     console = Console(quiet=quiet or as_json, stderr=as_json)
     outcome = fly_request(request, console)
@@ -94,9 +101,10 @@ def fly_request(request: Request, console: Console) -> Outcome:
             _rehearse(sim, request)
         console.print(f"world and kernels ready in {time.perf_counter() - started:.1f} s")
         log_file = request.out / "flight.log"
-        with closing(FlightLog(log_file, store_all=request.log_all)) as log:
+        with closing(FlightLog(log_file, store_all=request.log_all, record=request.record)) as log:
             tracks = Tracks()
             flight, stack = _prepare(sim, request, log, [tracks])
+            log.begin(_header(request, stack))
             started = time.perf_counter()
             _run(flight, request, tracks, console)
             wall_s = time.perf_counter() - started
@@ -109,6 +117,17 @@ def _prepare(
     """A flight at its start, and the nodes of the stack in it."""
     stack = build(request.config, request.mission, seed=request.seed)
     return Flight([sim.new_node(), *stack], request.config.lockstep, log=log, listeners=listeners), stack
+
+
+def _header(request: Request, stack: list[Node]) -> Header:
+    """What a replay rebuilds the stack from."""
+    return Header(
+        group="lockstep",
+        nodes=tuple(name(node) for node in stack),
+        seed=request.seed,
+        mission=_read(request.mission_file),
+        config=dump_config(request.config),
+    )
 
 
 def _rehearse(sim: simulation.Simulator, request: Request) -> None:

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 import companion
-from companion.cli import config, doctor, fly, mavlink, mission, odometry, sim
+from companion.cli import config, doctor, fly, mavlink, mission, odometry, replay, sim
 from companion.core.errors import CompanionError
 
 app = typer.Typer(
@@ -19,6 +19,7 @@ app = typer.Typer(
 )
 app.command("fly")(fly.fly)
 app.command("sim")(sim.sim)
+app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.command("odometry")(odometry.odometry)
 

@@ -1,73 +1,79 @@
-"""The log of a flight: every message once, every delivery in order, and the flight's hash.
+"""The log of a flight in lockstep: every message once, every delivery in order, and the flight's hash.
 
-A file of entries, each a 4-byte little-endian length and a MessagePack array:
-`[0, time_ns, source, topic, payload]` per message (payload nil where the topic is not
-stored; its digest still counts) and `[1, time_ns, node, event, message number]` per
-delivery or tick (number -1). Replaying a node's deliveries reproduces its outputs.
+The simulator is outside of what the log can replay: `record=True` stores what it sends in full.
+The file's format: `companion.runtime.log_file`.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import msgspec
-from xxhash import xxh3_128_hexdigest
+from xxhash import xxh3_128_digest
 
 from companion.core.node import Topic
 from companion.runtime.codec import encode, encode_into
+from companion.runtime.log_file import Header, LogFile, read_log
 
 
 class FlightLog:
-    """A tap that hashes everything and stores what the topic table says."""
+    """A tap that hashes everything and stores what the topic table says.
 
-    def __init__(self, path: Path | None, *, store_all: bool = False) -> None:
+    `record`: the messages of everyone who is not in the header, too (`begin`), which a replay needs;
+    `store_all`: every message.
+    """
+
+    def __init__(self, path: Path | None, *, store_all: bool = False, record: bool = False) -> None:
         self.counts: Counter[str] = Counter()
-        self._file: BinaryIO | None = path.open("wb", buffering=1 << 20) if path else None
-        self._store_all = store_all
+        self._file = LogFile(path) if path else None
+        self._store_all, self._record = store_all, record
+        self._nodes: frozenset[str] | None = None
         self._hash = hashlib.sha256()
         self._number = -1
+        self._newest_ns = 0
         self._scratch: defaultdict[str, bytearray] = defaultdict(bytearray)  # by topic: sizes repeat
-        self._pack = msgspec.msgpack.Encoder().encode
 
     @property
     def flight_hash(self) -> str:
         """SHA-256 over time, source, topic and XXH3-128 of the bytes of every message so far."""
         return self._hash.hexdigest()
 
+    def begin(self, header: Header) -> None:
+        """Say what the nodes are rebuilt from; a log without cannot be replayed."""
+        self._nodes = frozenset(header.nodes)
+        if self._file:
+            self._file.header(header)
+
     def published(self, now_ns: int, source: str, topic: Topic[Any], message: Any) -> int:
         """Hash a message, store it where its topic is recorded; returns its number."""
-        stored = topic.recorded or self._store_all
+        stored = topic.recorded or self._store_all or (self._record and self._is_outside(source))
         data = encode(message) if stored else encode_into(message, self._scratch[topic.name])
+        digest = xxh3_128_digest(data)
         # Maps are 100 MB per flown second: a fast digest of each message, a strong hash over the digests.
-        self._hash.update(f"{now_ns} {source} {topic.name} {len(data)} {xxh3_128_hexdigest(data)} ".encode())
+        self._hash.update(f"{now_ns} {source} {topic.name} {len(data)} {digest.hex()} ".encode())
         self.counts[topic.name] += 1
         self._number += 1
-        self._write((0, now_ns, source, topic.name, data if stored else None))
+        self._newest_ns = now_ns
+        if self._file:
+            self._file.message(now_ns, source, topic.name, data if stored else None, digest)
         return self._number
 
     def fed(self, now_ns: int, node: str, event: str, number: int) -> None:
-        """Store one delivery."""
-        self._write((1, now_ns, node, event, number))
-
-    def _write(self, entry: tuple[Any, ...]) -> None:
-        if self._file:
-            data = self._pack(entry)
-            self._file.write(len(data).to_bytes(4, "little") + data)
+        """Store one delivery; those of the outside cannot be replayed and are left out."""
+        if self._file and not self._is_outside(node):
+            self._file.fed(now_ns, node, event, number)
 
     def close(self) -> None:
         """Flush and close the file."""
         if self._file:
+            if self._nodes is not None:
+                self._file.end(self._newest_ns)
             self._file.close()
 
+    def _is_outside(self, source: str) -> bool:
+        return self._nodes is not None and source not in self._nodes
 
-def read_log(path: Path) -> Iterator[list[Any]]:
-    """The entries of a flight log, in order; a torn last entry is left out."""
-    with path.open("rb") as file:
-        while len(head := file.read(4)) == 4:
-            entry = file.read(int.from_bytes(head, "little"))
-            if len(entry) == int.from_bytes(head, "little"):
-                yield msgspec.msgpack.decode(entry)
+
+__all__ = ["FlightLog", "read_log"]
