@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 from companion.autopilot.node import AutopilotNode
 from companion.config import Config
 from companion.core.node import Node
 from companion.estimation.node import GraphNode, LioNode, PropagatorNode
+from companion.estimation.warm_up import warm_up
 from companion.mapping.node import MappingNode
 from companion.mission.model import Mission
 from companion.mission.node import MissionNode
@@ -14,18 +17,44 @@ from companion.safety.node import SafetyNode
 from companion.sensors.node import SensorsNode
 from companion.tracking.node import TrackingNode
 
+NODES = (
+    SensorsNode, LioNode, PropagatorNode, GraphNode, MappingNode, PlanningNode, TrackingNode, MissionNode,
+    SafetyNode, AutopilotNode,
+)  # fmt: skip
 
-def build(config: Config, mission: Mission, *, seed: int) -> list[Node]:
-    """All nodes of the stack, ready to be run by `companion.runtime`."""
-    return [
-        SensorsNode(config.sensors),
-        LioNode(config.estimation, config.rig),
-        PropagatorNode(config.estimation),
-        GraphNode(config.estimation, config.rig),
-        MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m),
-        PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),
-        TrackingNode(config.tracking),
-        MissionNode(mission, config.mission),
-        SafetyNode(config.safety, fence=mission.fence),
-        AutopilotNode(config.autopilot),
-    ]
+GROUPS: dict[str, tuple[type[Node], ...]] = {
+    # One process each when the stack runs live: what control needs at once runs where control runs.
+    "perception": (SensorsNode, LioNode),
+    "graph": (GraphNode,),
+    "world": (MappingNode, PlanningNode),
+    "control": (PropagatorNode, TrackingNode, MissionNode, SafetyNode, AutopilotNode),
+}
+
+
+def build(
+    config: Config,
+    mission: Mission,
+    *,
+    seed: int,
+    only: Sequence[type[Node]] = NODES,
+) -> list[Node]:
+    """The nodes of the stack (or some of them), ready to be run by `companion.runtime`."""
+    makers: dict[type[Node], Callable[[], Node]] = {
+        SensorsNode: lambda: SensorsNode(config.sensors),
+        LioNode: lambda: LioNode(config.estimation, config.rig),
+        PropagatorNode: lambda: PropagatorNode(config.estimation),
+        GraphNode: lambda: GraphNode(config.estimation, config.rig),
+        MappingNode: lambda: MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m),
+        PlanningNode: lambda: PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),
+        TrackingNode: lambda: TrackingNode(config.tracking),
+        MissionNode: lambda: MissionNode(mission, config.mission),
+        SafetyNode: lambda: SafetyNode(config.safety, fence=mission.fence),
+        AutopilotNode: lambda: AutopilotNode(config.autopilot),
+    }
+    return [makers[kind]() for kind in only]
+
+
+def warm(config: Config, nodes: Sequence[Node]) -> None:
+    """Compile the kernels that the nodes' constructors have not compiled yet."""
+    if any(isinstance(node, LioNode | PropagatorNode) for node in nodes):
+        warm_up(config.estimation, config.rig)

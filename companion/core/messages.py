@@ -287,6 +287,16 @@ class SafetyStatus:
     reason: str
 
 
+@message
+class NodeHealth:
+    """Whether a node of a live stack runs; said by who started it, when that changes."""
+
+    stamp_ns: int
+    node: str
+    alive: bool
+    reason: str  # why it is down
+
+
 # --- autopilot ----------------------------------------------------------------------
 
 

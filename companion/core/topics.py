@@ -45,7 +45,7 @@ SMOOTHED = Topic("estimation/smoothed", m.SmoothedState, 10.0)
 LOCAL_MAP = Topic("mapping/local_map", m.LocalMap, 5.0, recorded=False, deadline_s=1.0, service="bulk")
 MAP_STATUS = Topic("mapping/status", m.MapStatus, 5.0, deadline_s=1.0)
 # mission
-GOAL = Topic("mission/goal", m.Goal, 0.0)
+GOAL = Topic("mission/goal", m.Goal, 0.0, service="latched")  # a planner that starts again needs it
 VEHICLE_COMMAND = Topic("mission/vehicle_command", m.VehicleCommand, 0.0, "all", service="control")
 MISSION = Topic("mission/status", m.MissionStatus, 2.0)
 WHY = Topic("why", m.Why, 0.0, "all")
@@ -53,6 +53,7 @@ WHY = Topic("why", m.Why, 0.0, "all")
 TRAJECTORY = Topic("planning/trajectory", m.Trajectory, 5.0)
 PLAN = Topic("planning/status", m.PlanStatus, 5.0)
 # safety, tracking
+HEALTH = Topic("runtime/health", m.NodeHealth, 0.0, "all", service="control")
 SAFETY = Topic("safety/status", m.SafetyStatus, 20.0, deadline_s=0.2, service="control")
 SETPOINT = Topic("tracking/setpoint", m.Setpoint, 50.0, deadline_s=0.2, service="control")
 # autopilot out

@@ -15,6 +15,7 @@ import msgspec
 
 Action = Literal["ok", "slow", "hold", "land"]
 RANK: dict[Action, int] = {"ok": 0, "slow": 1, "hold": 2, "land": 3}
+NEEDED = ("LioNode", "MappingNode", "PlanningNode")  # nothing is flown without them
 Seconds = Annotated[float, msgspec.Meta(gt=0)]
 Metres = Annotated[float, msgspec.Meta(gt=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -77,6 +78,7 @@ class Health:
     battery_fraction: float  # < 0 or NaN: not known
     fence_depth_m: float  # inside > 0, outside < 0; infinite: no fence
     outside_s: float  # how long outside the fence
+    down: tuple[tuple[str, str], ...] = ()  # (node, reason) of what does not run
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +138,7 @@ def _sensing(h: Health, c: SafetyConfig) -> Iterator[Verdict]:
     yield from _graded(
         h.lidar_age_s, "s", "LiDAR update age", slow=c.lidar_slow_s, hold=c.lidar_hold_s, land=c.lidar_land_s
     )
+    yield from (Verdict("hold", f"{node} is down: {reason}") for node, reason in h.down if node in NEEDED)
     yield from _graded(h.map_age_s, "s", "local map age", slow=c.map_slow_s, hold=c.map_hold_s, land=c.map_land_s)
 
 

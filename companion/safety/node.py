@@ -13,6 +13,7 @@ from companion.core.messages import (
     Array,
     LioState,
     MapStatus,
+    NodeHealth,
     Odometry,
     SafetyStatus,
     SmoothedState,
@@ -35,6 +36,7 @@ class SafetyNode(Node):
         self._smoothed: SmoothedState | None = None
         self._lidar_ns: int | None = None
         self._map_ns: int | None = None
+        self._down: dict[str, str] = {}  # node -> why
         self._p_map_home: Array | None = None
         self._airborne_ns: int | None = None
         self._outside_ns: int | None = None
@@ -61,6 +63,12 @@ class SafetyNode(Node):
     @on(topics.MAP_STATUS)
     def _take_map(self, message: MapStatus) -> None:
         self._map_ns = message.stamp_ns
+
+    @on(topics.HEALTH)
+    def _take_health(self, message: NodeHealth) -> None:
+        self._down.pop(message.node, None)
+        if not message.alive:
+            self._down[message.node] = message.reason
 
     @every(hz=20)
     def watch(self, now_ns: int) -> Outputs:
@@ -103,6 +111,7 @@ class SafetyNode(Node):
             battery_fraction=vehicle.battery_fraction if vehicle else math.nan,
             fence_depth_m=depth_m,
             outside_s=_age_s(now_ns, self._outside_ns) if outside else 0.0,
+            down=tuple(self._down.items()),
         )
 
     def _follow(self, now_ns: int) -> None:

@@ -181,3 +181,18 @@ def test_leaving_the_fence_slows_holds_lands():
     flight.p = np.array([105.5, 50.0, 3.0])
     assert flight.run(4.0).action == "hold"
     assert flight.run(2.0).action == "land"
+
+
+def test_a_node_that_is_down_holds_in_the_air_until_it_is_back():
+    flight = Guarded()
+    flight.run(1.0)
+    down = m.NodeHealth(stamp_ns=flight.now_ns, node="PlanningNode", alive=False, reason="ended with code -9")
+    list(flight.node.handle(topics.HEALTH, down))
+    status = flight.run(0.05)
+    assert (status.action, status.reason) == ("hold", "PlanningNode is down: ended with code -9")
+    back = m.NodeHealth(stamp_ns=flight.now_ns, node="PlanningNode", alive=True, reason="")
+    list(flight.node.handle(topics.HEALTH, back))
+    assert flight.run(1.0).action == "ok"
+    gone = m.NodeHealth(stamp_ns=flight.now_ns, node="GraphNode", alive=False, reason="killed")
+    list(flight.node.handle(topics.HEALTH, gone))
+    assert flight.run(1.0).action == "ok"  # nothing of the flight leans on the graph at once
