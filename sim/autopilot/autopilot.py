@@ -23,6 +23,7 @@ from sim.autopilot.commands import Commands
 from sim.autopilot.control import Controller
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.inbox import Inbox
+from sim.autopilot.mission_flight import MissionFlight
 from sim.autopilot.mission_store import MissionStore
 from sim.autopilot.modes import Severity
 from sim.autopilot.params import Parameters, ParameterService, airframe_defaults
@@ -66,7 +67,12 @@ class Autopilot:
         )  # fmt: skip
         self._streams = Streams(self._telemetry.ids, rng)
         uid = int(rng.integers(1, 1 << 62))
-        self._commands = Commands(self.commander, self._telemetry, self._streams, self._encoder, uid=uid)
+        self._commands = Commands(
+            self.commander, self._telemetry, self._streams, self._encoder, missions=self._missions, uid=uid,
+        )  # fmt: skip
+        self._mission_flight = MissionFlight(
+            self._missions, self.commander, place=self._commands.place, say=self._say
+        )  # fmt: skip
         self.timesync = TimeSync()
         self._services = ParameterService(self.parameters, self._encoder)
         self._inbox = Inbox(
@@ -146,6 +152,8 @@ class Autopilot:
         self.estimator.gps(fix)
         if self.estimator.global_position and not self._telemetry.origin_known:
             self._commands.set_origin(*self._telemetry.origin)
+        if self.estimator.global_position and not self.armed and not self.commander.home_set:
+            self.commander.set_home(self.estimator.p)
 
     def _supervise(self, own_ns: int, battery_voltage: float) -> None:
         p, dt = self.parameters, STEP_S * POSITION_STEPS
@@ -155,6 +163,7 @@ class Autopilot:
             charge = (battery_voltage / p["BAT1_N_CELLS"] - empty) / max(full - empty, 0.01)
             self.commander.battery += 0.005 * (min(max(charge, 0.0), 1.0) - self.commander.battery)
         self.estimator.hold(at_rest=self.commander.flight.landed)
+        self._mission_flight.step(own_ns)
         self.commander.tick(own_ns, dt)
 
     def _say(self, severity: Severity, text: str) -> None:

@@ -25,6 +25,7 @@ NS: Final = 1_000_000_000
 STREAM_NS: Final = NS // 2  # OFFBOARD needs a setpoint this fresh
 FORCE: Final = 21196  # the number that makes MAV_CMD_COMPONENT_ARM_DISARM skip the checks
 MAX_ARMING_TILT: Final = math.radians(60)
+LIFTING: Final = (Mode.TAKEOFF, Mode.MISSION)  # climb at first if they begin on the ground
 Say = Callable[[Severity, str], None]
 
 
@@ -52,6 +53,7 @@ class Commander:
         self.sticks = np.zeros(4)  # forward, right, up, yaw to the right: -1..1
         self.sticks_ns = NEVER
         self._climb_m = math.nan
+        self.mission_ready: Callable[[], bool] = lambda: False  # a mission is stored
         self._battery_warned = 0
         self.now_ns = 0
 
@@ -98,7 +100,8 @@ class Commander:
         if reasons:
             return Result.TEMPORARILY_REJECTED
         self.armed, self.failsafe = True, ""
-        self.home[:], self.home_set = self._estimator.p, self._estimator.xy_valid
+        self.set_home(self._estimator.p)
+        self.home_set = self._estimator.xy_valid
         self.flight.arm()
         self._say(Severity.INFO, "Armed by external command")
         return Result.ACCEPTED
@@ -135,6 +138,10 @@ class Commander:
         self._climb_m = climb_m
         return self.set_mode(now_ns, Mode.TAKEOFF)
 
+    def climb_to(self, climb_m: float) -> None:
+        """How far a mission that begins on the ground climbs first (NaN: MIS_TAKEOFF_ALT)."""
+        self._climb_m = climb_m
+
     def reposition(self, now_ns: int, target: Array, yaw: float) -> Result:
         """Fly to a place (NED, NaN: stay) in HOLD."""
         if not self.armed or self.flight.landed:
@@ -143,6 +150,14 @@ class Commander:
         if result is Result.ACCEPTED:
             self.guidance.go(target, yaw)
         return result
+
+    def brake(self) -> None:
+        """Stop here, in the mode that is on."""
+        self.guidance.start(self.mode, self._estimator, self.heading)
+
+    def set_home(self, p_ned: Array) -> None:
+        """Where RETURN leads."""
+        self.home[:], self.home_set = p_ned, True
 
     def accept_setpoint(self, now_ns: int, setpoint: Array) -> None:
         """A setpoint of the offboard stream, NED (11,)."""
@@ -164,7 +179,7 @@ class Commander:
         else:
             self._choose_demand(dt)
             self.flight.fly(self.demand, dt)
-            if self.mode is Mode.TAKEOFF and self._arrived():
+            if self.mode is Mode.TAKEOFF and self.arrived():
                 top = self.guidance.target.copy()
                 self._enter(Mode.HOLD)
                 self.guidance.go(top, math.nan)
@@ -184,7 +199,7 @@ class Commander:
         if patience > 0 and self.flight.on_ground_s > patience:
             self.disarm(why="landing" if flown else "auto preflight disarming")
         elif self.flight.ready_to_lift and self._estimator.xy_valid and self._wants_to_lift(now_ns):
-            if self.mode is Mode.TAKEOFF:
+            if self.mode in LIFTING:
                 yaw = self.heading
                 self.guidance.start(Mode.TAKEOFF, self._estimator, yaw, climb_m=self._climb())
             self._say(Severity.INFO, "Takeoff detected")
@@ -196,9 +211,10 @@ class Commander:
             return fresh and wants_up(self._setpoint, self._estimator.p)
         if self.mode is Mode.POSCTL:
             return bool(self.sticks[2] > 0.15)
-        return self.mode is Mode.TAKEOFF
+        return self.mode is Mode.TAKEOFF or (self.mode is Mode.MISSION and not self.flight.has_flown)
 
-    def _arrived(self) -> bool:
+    def arrived(self) -> bool:
+        """At the place that the guidance leads to, and slow."""
         return self.guidance.arrived(self._estimator, self._parameters["NAV_MC_ALT_RAD"])
 
     def _choose_demand(self, dt: float) -> None:
@@ -261,7 +277,7 @@ class Commander:
     # --- modes ------------------------------------------------------------------------
 
     def _mode_problem(self, now_ns: int, mode: Mode) -> str:
-        if mode is Mode.MISSION:
+        if mode is Mode.MISSION and not self.mission_ready():
             return "no valid mission"
         if mode is Mode.MANUAL:
             return "no remote control is built in"
@@ -276,7 +292,7 @@ class Commander:
         return ""
 
     def _enter(self, mode: Mode) -> None:
-        if mode is self.mode and mode in (Mode.TAKEOFF, Mode.LAND, Mode.RETURN):
+        if mode is self.mode and mode in (Mode.TAKEOFF, Mode.LAND, Mode.RETURN, Mode.MISSION):
             return
         self.mode = mode
         if mode.automatic:

@@ -8,10 +8,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from companion.core.messages import Array
 from sim.autopilot.codec import BY_NAME, LAYOUTS, Encoder
 from sim.autopilot.commander import FORCE, Commander
-from sim.autopilot.frames import local
+from sim.autopilot.mission_store import MissionStore
 from sim.autopilot.modes import BY_NUMBERS, Mode, Result
+from sim.autopilot.places import from_integers, place
 from sim.autopilot.streams import Streams
 from sim.autopilot.telemetry import Telemetry
 
@@ -20,8 +22,6 @@ from sim.autopilot.telemetry import Telemetry
 CAPABILITIES: Final = 4 | 8 | 16 | 128 | 8192 | 16384 | 32768
 VERSION: Final = 0x01120000 | 255  # 1.18.0, release
 FARTHEST_M: Final = 1e5  # no place beyond is flown to
-INT32_UNSET: Final = 0x7FFFFFFF
-LOCAL_FRAMES: Final = (1, 20)
 
 
 class Command(NamedTuple):
@@ -37,10 +37,11 @@ class Commands:
     """Executes commands; `extra` takes the frames that a command asks for."""
 
     def __init__(
-        self, commander: Commander, telemetry: Telemetry, streams: Streams, encoder: Encoder, *, uid: int
-    ) -> None:
+        self, commander: Commander, telemetry: Telemetry, streams: Streams, encoder: Encoder,
+        *, missions: MissionStore, uid: int,
+    ) -> None:  # fmt: skip
         self._commander, self._telemetry, self._streams = commander, telemetry, streams
-        self._encoder, self._uid = encoder, uid
+        self._encoder, self._missions, self._uid = encoder, missions, uid
         self.extra = bytearray()
         self._actions: dict[int, Callable[[Command], Result]] = {
             20: lambda c: self._commander.set_mode(c.now_ns, Mode.RETURN),
@@ -51,6 +52,7 @@ class Commands:
             178: self._change_speed,
             179: self._set_home,
             192: self._reposition,
+            224: self._set_current,
             300: lambda c: self._commander.set_mode(c.now_ns, Mode.MISSION),
             400: self._arm,
             510: self._get_interval,
@@ -110,11 +112,14 @@ class Commands:
             return Result.DENIED
         return self._commander.reposition(c.now_ns, target, c.params[3])
 
+    def _set_current(self, c: Command) -> Result:
+        return Result.ACCEPTED if self._missions.go_to(_integer(c.params[0])) else Result.DENIED
+
     def _set_home(self, c: Command) -> Result:
         home = self._commander.position.copy() if c.params[0] == 1.0 else self._place(c)
         if not (np.abs(home) < FARTHEST_M).all():
             return Result.DENIED
-        self._commander.home[:], self._commander.home_set = home, True
+        self._commander.set_home(home)
         self._send(242)
         return Result.ACCEPTED
 
@@ -133,19 +138,16 @@ class Commands:
         self.extra += self._encoder(BY_NAME["GPS_GLOBAL_ORIGIN"], *scaled, self._commander.now_ns // 1000)
         return Result.ACCEPTED
 
-    def _place(self, c: Command) -> Any:
+    def place(self, frame: int, xyz: tuple[float, float, float]) -> Array:
+        """p_ned (3,) of a place in a MAV_FRAME."""
+        return place(self._telemetry.origin, self._commander.home, frame, xyz)
+
+    def _place(self, c: Command) -> Array:
         """Target NED of parameters 5-7; unset components are NaN."""
         x, y, z = c.params[4:7]
         if c.integer:
-            unset = INT32_UNSET in (x, y)
-            scale = 1e-4 if c.frame in LOCAL_FRAMES else 1e-7
-            x, y = (math.nan, math.nan) if unset else (x * scale, y * scale)
-        if c.frame in LOCAL_FRAMES:
-            return np.array([x, y, z])
-        origin = self._telemetry.origin
-        relative = c.frame in (3, 6)  # GLOBAL_RELATIVE_ALT: above home
-        altitude = z + origin[2] - float(self._commander.home[2]) if relative else z
-        return local(origin, x, y, altitude)
+            x, y = from_integers(c.frame, int(x), int(y))
+        return self.place(c.frame, (x, y, z))
 
     def _get_interval(self, c: Command) -> Result:
         msg_id = _integer(c.params[0])
@@ -162,13 +164,13 @@ class Commands:
         return Result.ACCEPTED if done else Result.DENIED
 
     def _request(self, c: Command) -> Result:
-        return self._send(_integer(c.params[0]))
+        return self._send(_integer(c.params[0]), max(_integer(c.params[1]), 0))
 
-    def _send(self, msg_id: int) -> Result:
+    def _send(self, msg_id: int, wanted: int = 0) -> Result:
         if msg_id == 148:
             self.extra += self._version()
         elif msg_id == 435:
-            self._send_modes()
+            return self._send_modes(wanted)
         elif msg_id in self._telemetry.ids:
             frame = self._telemetry.pack(msg_id)
             self.extra += frame
@@ -184,13 +186,18 @@ class Commands:
             *none, *none, *none, *((0,) * 18),
         )  # fmt: skip
 
-    def _send_modes(self) -> None:
+    def _send_modes(self, wanted: int) -> Result:
+        """AVAILABLE_MODES of number `wanted`, from 1; 0: of all."""
         modes = list(BY_NUMBERS.values())
+        if wanted > len(modes):
+            return Result.DENIED
         for index, mode in enumerate(modes, 1):
-            text = mode.value[2].encode()
-            self.extra += self._encoder(
-                BY_NAME["AVAILABLE_MODES"], mode.custom_mode, 0, len(modes), index, 0, text
-            )  # fmt: skip
+            if wanted in (0, index):
+                text = mode.value[2].encode()
+                self.extra += self._encoder(
+                    BY_NAME["AVAILABLE_MODES"], mode.custom_mode, 0, len(modes), index, 0, text
+                )  # fmt: skip
+        return Result.ACCEPTED
 
 
 def _integer(value: float) -> int:

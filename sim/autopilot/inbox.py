@@ -15,11 +15,13 @@ from sim.autopilot.frames import euler_from_quaternion
 from sim.autopilot.mission_store import MissionStore
 from sim.autopilot.modes import BY_NUMBERS, Severity
 from sim.autopilot.params import ParameterService
+from sim.autopilot.places import from_integers
 from sim.autopilot.readings import ExternalPose
 from sim.autopilot.setpoint import Refused, read_setpoint
 from sim.autopilot.timesync import TimeSync
 
 LOCAL_NED, BODY_FRD, LOCAL_FRD = 1, 12, 20
+INT_FRAMES: Final = {0: 0, 3: 3, 5: 0, 6: 3}  # MAV_FRAME of a global setpoint: above sea, or above home
 VISION_TYPES: Final = (0, 1, 2, 3)  # MAV_ESTIMATOR_TYPE: unknown, naive, vision, VIO; not LIDAR (8)
 NAK, UNKNOWN_COMMAND = 129, 7  # FTP
 POSE_PLACES, VELOCITY_PLACES = (0, 6, 11, 20), (0, 6, 11)  # diagonal places: x, y, z, yaw
@@ -40,6 +42,7 @@ class Inbox:
             BY_NAME[name].msg_id: handler
             for name, handler in {
                 "SET_POSITION_TARGET_LOCAL_NED": self._setpoint,
+                "SET_POSITION_TARGET_GLOBAL_INT": self._global_setpoint,
                 "ODOMETRY": self._odometry,
                 "TIMESYNC": self._time,
                 "COMMAND_LONG": self._command_long,
@@ -78,6 +81,22 @@ class Inbox:
         values = frame.values
         if values[13] not in (0, self._system) or values[14] not in (0, 1):
             return
+        self._accept(now_ns, values)
+
+    def _global_setpoint(self, now_ns: int, frame: Frame) -> None:
+        """The same with a place on Earth: it becomes a local one."""
+        values = list(frame.values)  # time, latitude, longitude, altitude, v, a, yaw, yaw rate, mask, system...
+        if values[13] not in (0, self._system) or values[14] not in (0, 1):
+            return
+        kind = INT_FRAMES.get(values[15])
+        if kind is None:
+            self._say(Severity.CRITICAL, f"SET_POSITION_TARGET_GLOBAL_INT coordinate frame {values[15]} unsupported")
+            return
+        values[1:4] = self._commands.place(kind, (*from_integers(kind, values[1], values[2]), values[3]))
+        values[15] = LOCAL_NED
+        self._accept(now_ns, tuple(values))
+
+    def _accept(self, now_ns: int, values: tuple[float, ...]) -> None:
         setpoint = read_setpoint(values, euler_from_quaternion(self._estimator.q)[2])
         if isinstance(setpoint, Refused):
             self._say(Severity.CRITICAL, setpoint.text)

@@ -216,7 +216,8 @@ class Telemetry:
     def _extended_sys_state(self) -> bytes:
         c = self._commander
         taking_off = c.flight.phase is Phase.RAMP or c.mode is Mode.TAKEOFF
-        air = 4 if c.mode.lands else 3 if taking_off else 2
+        landing = c.mode.lands or (c.mode is Mode.MISSION and c.guidance.landing)
+        air = 4 if landing else 3 if taking_off else 2
         return self._encoder(self._layouts["EXTENDED_SYS_STATE"], 0, 1 if c.flight.landed else air)
 
     def _sys_status(self) -> bytes:
