@@ -73,6 +73,12 @@ class CommandDesk:
             return Verdict(waiting.kind, True, "")
         return Verdict(waiting.kind, False, _RESULTS.get(ack.result, f"result {ack.result}"))
 
+    def cancel(self, reason: str) -> list[Verdict]:
+        """Forget every waiting command, so that none is sent again; how they ended."""
+        ended = [Verdict(waiting.kind, False, reason) for waiting in self._waiting.values()]
+        self._waiting.clear()
+        return ended
+
     def tick(self) -> tuple[list[CommandLong], list[Verdict]]:
         """One step of time: what to send again, and which commands ran out of attempts."""
         again: list[CommandLong] = []

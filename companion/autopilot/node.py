@@ -2,32 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Final, Literal
 
 import msgspec
 
 from companion.autopilot import codec, modes, timesync
+from companion.autopilot.authority import Authority
 from companion.autopilot.commands import CommandDesk, Verdict
+from companion.autopilot.intervals import Intervals
+from companion.autopilot.neighbours import Neighbours
 from companion.autopilot.outgoing import Target, odometry_message, setpoint_message
+from companion.autopilot.signing import Signing
+from companion.autopilot.texts import News, Newsroom, Severity, pieces
 from companion.autopilot.timesync import TimesyncConfig, TimesyncFilter
 from companion.autopilot.vehicle import Id, State, Vehicle
 from companion.autopilot.wire import Frame, Parser
 from companion.core.messages import (
     CommandResult,
     MavlinkBytes,
+    MissionStatus,
     Odometry,
+    SafetyStatus,
     Setpoint,
     VehicleCommand,
+    Why,
 )
 from companion.core.node import Node, Output, Outputs, every, on
 from companion.core.topics import (
     COMMAND_RESULT,
     MAVLINK_RX,
     MAVLINK_TX,
+    MISSION,
     ODOMETRY,
+    SAFETY,
     SETPOINT,
     VEHICLE,
     VEHICLE_COMMAND,
+    WHY,
 )
 
 _Id = Annotated[int, msgspec.Meta(ge=1, le=255)]
@@ -39,20 +52,7 @@ _COMMAND_ACK: Final = 77
 _TIMESYNC: Final = 111
 _ONBOARD_CONTROLLER: Final = 18  # MAV_TYPE
 _ACTIVE: Final = 4  # MAV_STATE
-_NEEDED_HZ: Final[dict[modes.Flavour, dict[int, float]]] = {
-    "px4": {
-        Id.LOCAL_POSITION_NED: 30.0,
-        Id.EXTENDED_SYS_STATE: 5.0,
-        Id.SYS_STATUS: 2.0,
-        Id.ESTIMATOR_STATUS: 1.0,
-    },
-    "ardupilot": {
-        Id.LOCAL_POSITION_NED: 30.0,
-        Id.EXTENDED_SYS_STATE: 5.0,
-        Id.SYS_STATUS: 2.0,
-        Id.EKF_STATUS_REPORT: 2.0,
-    },
-}
+_REJECTED_EVERY_TICKS: Final = 100
 _WANTED: Final = (*Id, _COMMAND_ACK, _TIMESYNC)
 
 
@@ -89,15 +89,22 @@ class AutopilotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class AutopilotNode(Node):
-    """Speaks MAVLink with one autopilot. One setpoint in is one message out, never repeated."""
+    """Speaks MAVLink with one autopilot. One setpoint in is one message out, never repeated.
 
-    publishes = (MAVLINK_TX, VEHICLE, COMMAND_RESULT)
+    It never takes back what the pilot took (`authority`), and refuses to command beside a second
+    companion (`neighbours`); both are told by WHY, to the pilot as a text, and as the reason of
+    COMMAND_RESULT.
+    """
 
-    def __init__(self, config: AutopilotConfig) -> None:
+    publishes = (MAVLINK_TX, VEHICLE, COMMAND_RESULT, WHY)
+
+    def __init__(self, config: AutopilotConfig, *, signing_key: bytes | None = None) -> None:
+        """With a `signing_key` of 32 bytes all frames are signed, and others count as not come."""
         self._config = config
         self._target = Target(config.target_system, config.target_component)
-        self._parser = Parser(_WANTED)
-        self._encoder = codec.Encoder(system=config.system, component=config.component)
+        self._signing = None if signing_key is None else Signing(signing_key)
+        self._parser = Parser(_WANTED, signing=self._signing)
+        self._encoder = codec.Encoder(system=config.system, component=config.component, signing=self._signing)
         self._timesync = TimesyncFilter(config.timesync)
         self._desk = CommandDesk(ack_ticks=config.ack_ticks, attempts=config.attempts)
         self._vehicle = Vehicle(
@@ -105,8 +112,11 @@ class AutopilotNode(Node):
             data_timeout_s=config.data_timeout_s,
             require_prearm=config.require_prearm,
         )
-        self._intervals = _Intervals(config.interval_requests)
-        self._ticks = 0
+        self._intervals = Intervals(config.interval_requests, ticks_hz=_TICK_HZ)
+        self._authority = Authority()
+        self._neighbours = Neighbours(system=config.system, component=config.component)
+        self._newsroom = Newsroom()
+        self._ticks = self._texts = self._rejected_told = 0
         self._reported: State | None = None
         self._odometry_due_ns: int | None = None
         self._odometry_resets = -1
@@ -114,39 +124,85 @@ class AutopilotNode(Node):
     @on(MAVLINK_RX)
     def on_bytes(self, received: MavlinkBytes) -> Outputs:
         """Read what the autopilot says; tell the stack at once when its state changed."""
-        heard = False
-        for frame in self._parser.feed(received.data):
-            if frame.system == self._target.system and frame.component == self._target.component:
+        now_ns, heard = received.stamp_ns, False
+        for frame in self._parser.feed(received.data, now_ns):
+            sender = frame.system, frame.component
+            if sender == self._target:
                 heard = True
-                yield from self._on_frame(frame, received.stamp_ns)
-        if heard and self._vehicle.state(received.stamp_ns) != self._reported:
-            yield self._report(received.stamp_ns)
+                yield from self._on_frame(frame, now_ns)
+            elif sender == (self._config.system, self._config.component) and frame.msg_id == Id.HEARTBEAT:
+                yield from self._on_double(frame, now_ns)
+        if heard and self._vehicle.state(now_ns) != self._reported:
+            yield self._report(now_ns)
 
     def _on_frame(self, frame: Frame, now_ns: int) -> Outputs:
         message = codec.decode(frame)
         if frame.msg_id == _TIMESYNC:
             if message.tc1 == 0:
                 yield self._send(timesync.answer(message, now_ns), now_ns)
-            else:
-                self._timesync.learn(message, now_ns)
+                return
+            if self._vehicle.rebooted(_TIMESYNC, message.tc1 // 1_000_000 & 0xFFFFFFFF):
+                yield from self._start_anew(now_ns)
+            self._timesync.learn(message, now_ns)
         elif frame.msg_id == _COMMAND_ACK:
             if self._is_ours(message):
                 yield from self._results([self._desk.acknowledge(message)], now_ns)
         else:
-            self._vehicle.take(frame.msg_id, message, now_ns)
             self._intervals.heard(frame.msg_id)
+            if self._vehicle.take(frame.msg_id, message, now_ns, sequence=frame.sequence):
+                yield from self._start_anew(now_ns)
+            if frame.msg_id == Id.HEARTBEAT:
+                yield from self._watch_mode(now_ns)
 
     def _is_ours(self, ack: object) -> bool:
         """Zero addresses everyone, as old autopilots do."""
         system, component = getattr(ack, "target_system", 0), getattr(ack, "target_component", 0)
         return system in (0, self._config.system) and component in (0, self._config.component)
 
+    def _start_anew(self, now_ns: int) -> Outputs:
+        """The autopilot rebooted: nothing that it knew or we asked for holds any more."""
+        self._timesync.restart()
+        self._intervals.restart()
+        self._authority.restart()
+        yield from self._results(self._desk.cancel("the autopilot rebooted"), now_ns)
+        yield self._why(now_ns, "start anew with the autopilot", "it rebooted: its clock went back")
+        yield from self._tell(News(Severity.WARNING, "autopilot rebooted"), now_ns)
+
+    def _watch_mode(self, now_ns: int) -> Outputs:
+        """Notice a takeover; what still waits for an answer must not be sent again."""
+        state = self._vehicle.state(now_ns)
+        if self._authority.saw(state.mode, armed=state.armed, now_ns=now_ns):
+            reason = self._authority.reason
+            yield from self._results(self._desk.cancel(reason), now_ns)
+            yield self._why(now_ns, "stop setpoints and commands", reason)
+            yield from self._tell(News(Severity.WARNING, f"{state.mode} is not ours, setpoints stop"), now_ns)
+
+    def _on_double(self, frame: Frame, now_ns: int) -> Outputs:
+        if self._neighbours.heard(frame.sequence, now_ns):
+            yield self._why(now_ns, "refuse to command", self._neighbours.reason)
+            yield from self._tell(News(Severity.CRITICAL, self._neighbours.reason), now_ns)
+            yield self._report(now_ns)
+
+    def _refusal(self, kind: str, now_ns: int) -> str:
+        """Why we do not ask the autopilot for this now; '' if nothing is against it.
+
+        In flight, a second companion is no reason not to brake or land.
+        """
+        if self._authority.reason:
+            return self._authority.reason
+        needed = self._authority.flying and kind not in ("arm", "offboard")
+        return self._neighbours.reason if self._neighbours.present(now_ns) and not needed else ""
+
     @on(SETPOINT)
     def on_setpoint(self, setpoint: Setpoint) -> Outputs:
-        """Pass the demand on; one that controls nothing is dropped."""
+        """Pass the demand on; one that controls nothing is dropped, and all while it is not our flight."""
+        now_ns = setpoint.stamp_ns
+        doubled = self._neighbours.present(now_ns) and not self._authority.flying
+        if self._authority.reason or doubled:
+            return
         message = setpoint_message(setpoint, self._target, self._vehicle.flavour)
         if message is not None:
-            yield self._send(message, setpoint.stamp_ns)
+            yield self._send(message, now_ns)
 
     @on(ODOMETRY)
     def on_odometry(self, odometry: Odometry) -> Outputs:
@@ -177,17 +233,34 @@ class AutopilotNode(Node):
     @on(VEHICLE_COMMAND)
     def on_command(self, command: VehicleCommand) -> Outputs:
         """Ask the autopilot; the answer follows as COMMAND_RESULT."""
+        kind, now_ns = command.kind, command.stamp_ns
+        refusal = self._refusal(kind, now_ns)
+        if refusal:
+            yield from self._results([Verdict(kind, False, refusal)], now_ns)
+            return
         system, component = self._target
-        request = modes.order(command.kind, self._vehicle.flavour, system=system, component=component)
-        send, replaced = self._desk.submit(command.kind, request)
-        yield from self._results([replaced], command.stamp_ns)
+        request = modes.order(kind, self._vehicle.flavour, system=system, component=component)
+        send, replaced = self._desk.submit(kind, request)
+        yield from self._results([replaced], now_ns)
         if send:
-            yield self._send(request, command.stamp_ns)
+            self._authority.asked(kind, self._vehicle.state(now_ns).mode)
+            yield self._send(request, now_ns)
+
+    @on(SAFETY)
+    def on_safety(self, status: SafetyStatus) -> Outputs:
+        """Tell the pilot when the guards change their action."""
+        yield from self._tell(self._newsroom.safety(status), status.stamp_ns)
+
+    @on(MISSION)
+    def on_mission(self, status: MissionStatus) -> Outputs:
+        """Tell the pilot how the mission stands."""
+        yield from self._tell(self._newsroom.mission(status), status.stamp_ns)
 
     @every(hz=_TICK_HZ)
     def step(self, now_ns: int) -> Outputs:
         """Heartbeat at 1 Hz, TIMESYNC and VEHICLE at 10 Hz, retries of commands, message rates."""
         if self._ticks % _TICK_HZ == 0:
+            self._neighbours.sent(self._encoder.sequence)
             yield self._send(codec.Heartbeat(0, _ONBOARD_CONTROLLER, 8, 0, _ACTIVE), now_ns)
         self._ticks += 1
         connected = self._vehicle.connected(now_ns)
@@ -199,6 +272,8 @@ class AutopilotNode(Node):
         yield from self._results(ended, now_ns)
         for msg_id, hz in self._intervals.missing(self._vehicle.flavour, connected):
             yield self._send(self._interval_request(msg_id, hz), now_ns)
+        if self._ticks % _REJECTED_EVERY_TICKS == 1:
+            yield from self._tell_rejected(now_ns)
         yield self._report(now_ns)
 
     def _interval_request(self, msg_id: int, hz: float) -> codec.CommandLong:
@@ -206,50 +281,42 @@ class AutopilotNode(Node):
         return modes.command_long(modes.SET_INTERVAL, msg_id, 1e6 / hz, system=system, component=component)
 
     def _send(self, message: codec.HotMessage, now_ns: int) -> Output:
-        return MAVLINK_TX(MavlinkBytes(stamp_ns=now_ns, data=self._encoder.encode(message)))
+        return MAVLINK_TX(MavlinkBytes(stamp_ns=now_ns, data=self._encoder.encode(message, now_ns)))
 
     def _report(self, now_ns: int) -> Output:
+        """The status; not ready before we could have heard a second companion, nor beside one."""
         self._reported = self._vehicle.state(now_ns)
-        return VEHICLE(self._vehicle.status(now_ns))
+        status = self._vehicle.status(now_ns)
+        if not self._neighbours.listened(now_ns, connected=status.connected):
+            status = replace(status, ready=False)
+        if self._neighbours.present(now_ns):
+            status = replace(status, ready=False, text=self._neighbours.reason)
+        return VEHICLE(status)
 
-    def _results(self, verdicts: list[Verdict] | list[Verdict | None], now_ns: int) -> Outputs:
+    def _tell(self, news: News | None, now_ns: int) -> Outputs:
+        """A text to the pilot, if the autopilot is there to pass it on."""
+        if news is not None and self._vehicle.connected(now_ns):
+            self._texts = self._texts % 0xFFFF + 1
+            for piece in pieces(news, self._texts):
+                yield self._send(piece, now_ns)
+
+    def _tell_rejected(self, now_ns: int) -> Outputs:
+        """Frames that the key did not let pass, if there were more."""
+        if self._signing is None or self._signing.rejected.total == self._rejected_told:
+            return
+        r = self._signing.rejected
+        self._rejected_told = r.total
+        counts = f"{r.unsigned} unsigned, {r.forged} of another key or altered, {r.replayed} replayed so far"
+        yield self._why(now_ns, "ignore frames without our signature", counts)
+
+    def _why(self, now_ns: int, what: str, because: str) -> Output:
+        return WHY(Why(stamp_ns=now_ns, node="autopilot", what=what, because=because))
+
+    def _results(self, verdicts: Sequence[Verdict | None], now_ns: int) -> Outputs:
         for verdict in verdicts:
             if verdict is not None:
+                if not verdict.accepted:
+                    self._authority.refused(verdict.kind)
                 yield COMMAND_RESULT(
                     CommandResult(stamp_ns=now_ns, kind=verdict.kind, accepted=verdict.accepted, reason=verdict.reason)
                 )
-
-
-class _Intervals:
-    """Which needed messages come too slowly: looked at every 2 s of connection."""
-
-    WINDOW_TICKS: Final = 2 * _TICK_HZ
-
-    def __init__(self, requests_max: int) -> None:
-        self._requests_max = requests_max
-        self._restart()
-
-    def _restart(self) -> None:
-        self._ticks = 0
-        self._counts: dict[int, int] = {}
-        self._requests: dict[int, int] = {}
-
-    def heard(self, msg_id: int) -> None:
-        self._counts[msg_id] = self._counts.get(msg_id, 0) + 1
-
-    def missing(self, flavour: modes.Flavour, connected: bool) -> list[tuple[int, float]]:
-        """One tick: (id, rate in Hz) of what came at less than half its rate."""
-        if not connected:
-            self._restart()
-            return []
-        self._ticks += 1
-        if self._ticks % self.WINDOW_TICKS:
-            return []
-        slow: list[tuple[int, float]] = []
-        for msg_id, hz in _NEEDED_HZ[flavour].items():
-            asked = self._requests.get(msg_id, 0)
-            if self._counts.get(msg_id, 0) < 0.5 * hz * 2 and asked < self._requests_max:
-                self._requests[msg_id] = asked + 1
-                slow.append((msg_id, hz))
-        self._counts = {}
-        return slow

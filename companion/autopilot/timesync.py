@@ -40,9 +40,10 @@ class TimesyncFilter:
 
     def __init__(self, config: TimesyncConfig) -> None:
         self._config = config
-        self._start()
+        self.restart()
 
-    def _start(self) -> None:
+    def restart(self) -> None:
+        """Forget everything: the other clock started anew."""
         self._samples = 0
         self._base_ns = 0  # the first offset, exact; floats hold only the rest
         self._rest_ns = 0.0
@@ -79,7 +80,7 @@ class TimesyncFilter:
         if self.converged and abs(offset_ns - self.offset_ns) > self._config.outlier_ms * 1e6:
             self._outliers += 1
             if self._outliers > self._config.outliers_max:
-                self._start()
+                self.restart()
             return
         self._outliers = 0
         self._smooth(offset_ns)

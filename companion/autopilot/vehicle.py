@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from companion.autopilot import frames
+from companion.autopilot.boot_clock import BootClock
 from companion.autopilot.modes import AUTOPILOT_ARDUPILOT, Flavour, mode_name
 from companion.core.messages import Array, VehicleStatus, freeze
 
@@ -17,6 +18,7 @@ class Id(IntEnum):
 
     HEARTBEAT = 0
     SYS_STATUS = 1
+    SYSTEM_TIME = 2
     LOCAL_POSITION_NED = 32
     BATTERY_STATUS = 147
     EKF_STATUS_REPORT = 193  # ArduPilot's
@@ -30,6 +32,7 @@ _NOT_AN_AUTOPILOT: Final = 8  # MAV_AUTOPILOT_INVALID
 _ON_GROUND: Final = 1  # MAV_LANDED_STATE
 _PREARM_CHECK: Final = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
 # ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS share these bits
+_OVERTAKEN_NS: Final = 250_000_000  # by so much one datagram may overtake another
 _NEEDED: Final = 1 | 2 | 4 | 32  # attitude, horizontal and vertical velocity, height
 _POSITION: Final = 8 | 16  # relative or absolute
 _EKF_NO_AIDING: Final = 128 | 1024  # EKF_STATUS_REPORT only: constant position, uninitialised
@@ -53,7 +56,13 @@ class Vehicle:
         self._heartbeat_timeout_ns = round(heartbeat_timeout_s * 1e9)
         self._data_timeout_ns = round(data_timeout_s * 1e9)
         self._require_prearm = require_prearm
+        self._boot_clock = BootClock()
+        self.flavour: Flavour = "px4"
+        self._forget()
+
+    def _forget(self) -> None:
         self._heard: dict[int, int] = {}  # message id -> stamp of the newest
+        self._sequence = 0  # of the newest heartbeat
         self._armed = False
         self._custom_mode = 0
         self._landed_state = 0
@@ -62,18 +71,33 @@ class Vehicle:
         self._battery = float("nan")
         self._p_odom, self._v_odom = np.full(3, np.nan), np.full(3, np.nan)
         self._text = _Text()
-        self.flavour: Flavour = "px4"
 
-    def take(self, msg_id: int, message: Any, now_ns: int) -> None:
-        """Note one message; ids without meaning here are ignored."""
+    def rebooted(self, msg_id: int, boot_ms: int) -> bool:
+        """Note the time since boot that message `msg_id` tells; if it went back, forget what was before."""
+        if not self._boot_clock.went_back(msg_id, boot_ms):
+            return False
+        self._forget()
+        return True
+
+    def take(self, msg_id: int, message: Any, now_ns: int, *, sequence: int = 0) -> bool:
+        """Note one message; ids without meaning here are ignored. True if it shows a reboot.
+
+        Heartbeats and positions that others overtook on the way are dropped; `sequence` is the frame's.
+        """
+        rebooted = False
         match msg_id:
             case Id.HEARTBEAT:
-                if not self._take_heartbeat(message):
-                    return
+                if not self._take_heartbeat(message, sequence, now_ns):
+                    return False
             case Id.SYS_STATUS:
                 self._prearm_ok = bool(message.onboard_control_sensors_health & _PREARM_CHECK)
                 self._take_battery(message.battery_remaining)
+            case Id.SYSTEM_TIME:
+                rebooted = self.rebooted(msg_id, message.time_boot_ms)
             case Id.LOCAL_POSITION_NED:
+                rebooted = self.rebooted(msg_id, message.time_boot_ms)
+                if self._boot_clock.is_late(msg_id, message.time_boot_ms):
+                    return False
                 self._p_odom = frames.swap_world(np.array(message[1:4]))
                 self._v_odom = frames.swap_world(np.array(message[4:7]))
             case Id.BATTERY_STATUS:
@@ -86,10 +110,17 @@ class Vehicle:
             case Id.STATUSTEXT:
                 self._text.take(message)
         self._heard[msg_id] = now_ns
+        return rebooted
 
-    def _take_heartbeat(self, message: Any) -> bool:
+    def _take_heartbeat(self, message: Any, sequence: int, now_ns: int) -> bool:
         if message.autopilot == _NOT_AN_AUTOPILOT:
             return False
+        before_ns = self._heard.get(Id.HEARTBEAT)
+        ahead = (sequence - self._sequence) & 0xFF
+        soon = before_ns is not None and now_ns - before_ns < _OVERTAKEN_NS
+        if soon and ahead >= 128:
+            return False
+        self._sequence = sequence
         self.flavour = "ardupilot" if message.autopilot == AUTOPILOT_ARDUPILOT else "px4"
         self._armed = bool(message.base_mode & _ARMED)
         self._custom_mode = message.custom_mode

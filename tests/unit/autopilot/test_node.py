@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import all as dialect
 
 from companion.autopilot import codec
 from companion.autopilot.inspect import Record, read_tlog
-from companion.autopilot.node import AutopilotConfig, AutopilotNode
 from companion.autopilot.timesync import TimesyncConfig
 from companion.autopilot.wire import Parser
 from companion.core.geometry import quaternion_from_yaw
@@ -27,79 +26,21 @@ from companion.core.topics import (
     VEHICLE,
     VEHICLE_COMMAND,
 )
+from tests.unit.autopilot.flight_bench import (
+    ESTIMATOR_GOOD,
+    MS,
+    OFFBOARD,
+    Flight,
+    S,
+    estimator,
+    heartbeat,
+    landed,
+    position,
+    ready_flight,
+    sys_status,
+)
 
 LOGS = Path(__file__).parents[4] / "shared/data/log_mavlink_tlog"
-S, MS = 10**9, 10**6
-OFFBOARD, HOLD = 6 << 16, 4 << 16 | 3 << 24
-ESTIMATOR_GOOD = 1 | 2 | 4 | 8 | 32
-PREARM = 1 << 28
-
-
-class Flight:
-    """A node with a scripted autopilot on the other end of the link."""
-
-    def __init__(self, *, system=1, component=1, **config) -> None:
-        self.node = AutopilotNode(AutopilotConfig(**config))
-        self.mav = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
-        self.out = []
-        self.parser = Parser()
-
-    def hear(self, now_ns, *messages, system=1, component=1):
-        self.mav.srcSystem, self.mav.srcComponent = system, component
-        for message in messages:
-            data = bytes(message.pack(self.mav))
-            self._take(self.node.handle(MAVLINK_RX, MavlinkBytes(stamp_ns=now_ns, data=data)))
-        return self
-
-    def tick(self, now_ns):
-        self._take(self.node.tick("step", now_ns))
-        return self
-
-    def feed(self, topic, message):
-        self._take(self.node.handle(topic, message))
-        return self
-
-    def _take(self, outputs):
-        self.out += list(outputs)
-
-    def published(self, topic):
-        return [o.message for o in self.out if o.topic is topic]
-
-    def sent(self, kind=None):
-        """Decoded messages that went out since the last call."""
-        frames = [f for m in self.published(MAVLINK_TX) for f in self.parser.feed(m.data)]
-        self.out = [o for o in self.out if o.topic is not MAVLINK_TX]
-        messages = [codec.decode(f) for f in frames]
-        return [m for m in messages if kind is None or isinstance(m, kind)]
-
-    @property
-    def status(self):
-        return self.published(VEHICLE)[-1]
-
-
-def heartbeat(custom_mode=HOLD, *, armed=False, autopilot=12):
-    return dialect.MAVLink_heartbeat_message(2, autopilot, 29 | (128 if armed else 0), custom_mode, 3, 3)
-
-
-def sys_status(*, health=PREARM, battery=80):
-    return dialect.MAVLink_sys_status_message(0, 0, health, 0, 16000, 100, battery, 0, 0, 0, 0, 0, 0)
-
-
-def estimator(flags=ESTIMATOR_GOOD):
-    return dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 0, 0)
-
-
-def position(x=2.0, y=1.0, z=-3.0):
-    return dialect.MAVLink_local_position_ned_message(0, x, y, z, 0.2, 0.1, -0.3)
-
-
-def landed(state=1):
-    return dialect.MAVLink_extended_sys_state_message(0, state)
-
-
-def ready_flight(now_ns=S, **config) -> Flight:
-    flight = Flight(**config)
-    return flight.hear(now_ns, heartbeat(), sys_status(), estimator(), position(), landed())
 
 
 def test_status_in_our_frames():
@@ -174,7 +115,9 @@ def test_prearm_can_be_waived():
 def test_ardupilot_is_recognised():
     flight = Flight()
     flags = dialect.MAVLink_ekf_status_report_message(ESTIMATOR_GOOD, 0, 0, 0, 0, 0)
-    flight.hear(S, heartbeat(4, autopilot=3), sys_status(), flags, position()).tick(S)
+    flight.hear(-S, heartbeat(4, autopilot=3)).hear(S, heartbeat(4, autopilot=3), sys_status(), flags, position()).tick(
+        S
+    )
     assert (flight.status.mode, flight.status.ready) == ("OFFBOARD", True)
     lost = dialect.MAVLink_ekf_status_report_message(ESTIMATOR_GOOD | 128, 0, 0, 0, 0, 0)
     assert not flight.hear(S, lost).tick(S).status.ready
