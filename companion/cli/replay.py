@@ -20,7 +20,7 @@ from companion.runtime.flight_folder import logs_of, read_header, rebuild
 from companion.runtime.log_file import Header
 from companion.runtime.message_diff import TopicDifferences
 from companion.runtime.replay import RECORD_HINT, Replay
-from companion.runtime.replay_report import NodeReport
+from companion.runtime.replay_report import Difference, NodeReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def _print(done: _Done, console: Console, *, changed: bool) -> None:
             f"not replayed, since inputs are not stored: {missing}. That takes {RECORD_HINT}", highlight=False
         )
     if run.first:
-        console.print(f"[red]first difference:[/] {_plain(run.first)}", highlight=False, soft_wrap=True)
+        _print_difference("[red]first difference[/]", run.first, console)
     if changed:
         _print_changed(run, console)
 
@@ -123,7 +123,7 @@ def _print_changed(run: Replay, console: Console) -> None:
         console.print("the change makes no difference to any output")
         return
     first = min(found, key=lambda d: d.time_ns)
-    console.print(f"first output that is changed: {_plain(first)}", highlight=False, soft_wrap=True)
+    _print_difference("first output that is changed", first, console)
     table = Table("node", "topic", "compared", "differing", "missing", "new", "largest |difference|", box=None)
     for node, report in run.reports.items():
         for topic, t in report.changed.items():
@@ -179,5 +179,7 @@ def _node_json(report: NodeReport, *, changed: bool) -> dict[str, Any]:
     return plain
 
 
-def _plain(value: object) -> str:
-    return str(value).replace("[", r"\[")
+def _print_difference(title: str, difference: Difference, console: Console) -> None:
+    console.print(f"{title}: {difference.place}", highlight=False, soft_wrap=True)
+    for line in difference.what:
+        console.print("  " + line.replace("[", r"\["), highlight=False, soft_wrap=True)

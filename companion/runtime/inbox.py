@@ -6,6 +6,7 @@ disk therefore delays no node: when too much waits, the log stops and says so, t
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any
@@ -81,6 +82,8 @@ class InboxLog:
             self.failure = f"cannot be written: {type(error).__name__}: {error}"
             with self._lock:
                 self._waiting.clear()
+            with suppress(OSError):
+                self._file.close()
 
     def _drain(self) -> None:
         with self._lock:

@@ -74,8 +74,8 @@ def _largest(a: Any, b: Any) -> float:
         return float(abs(int(x) - int(y)))  # stamps: float64 has no single nanoseconds
     with np.errstate(invalid="ignore"):
         gap = np.abs(x.astype(float) - y.astype(float))
-    gap[()] = np.where((x == y) | (_nan(x) & _nan(y)), 0.0, gap)
-    return float(np.where(np.isnan(gap), math.inf, gap).max(initial=0.0))
+    gap = np.where((x == y) | (_nan(x) & _nan(y)), 0.0, np.where(np.isnan(gap), math.inf, gap))
+    return float(gap.max(initial=0.0))
 
 
 def _nan(x: Any) -> Any:

@@ -17,9 +17,14 @@ class Difference:
     stamp_ns: int  # of the message; -1 if nobody knows it
     what: tuple[str, ...]
 
-    def __str__(self) -> str:
+    @property
+    def place(self) -> str:
+        """Node, topic, stamp, and the time in the log."""
         stamp = f"stamp {self.stamp_ns}" if self.stamp_ns >= 0 else "stamp unknown"
-        return f"{self.node}, {self.topic}, {stamp}, at {self.time_ns * 1e-9:.6f} s: {'; '.join(self.what)}"
+        return f"{self.node}, {self.topic}, {stamp}, at {self.time_ns * 1e-9:.6f} s"
+
+    def __str__(self) -> str:
+        return f"{self.place}: {'; '.join(self.what)}"
 
 
 @dataclass(slots=True)
