@@ -8,10 +8,28 @@ from typing import Final
 
 from companion.core.errors import LinkError
 from companion.runtime.ports.endpoint import Endpoint
-from companion.runtime.ports.port import READ_BYTES, Outbox, Report, Traffic, bound, cannot_listen, resolve, shown
+from companion.runtime.ports.port import (
+    PENDING_BYTES,
+    READ_BYTES,
+    Outbox,
+    Report,
+    Traffic,
+    bound,
+    cannot_listen,
+    resolve,
+    shown,
+)
 
 CONNECT_S: Final = 1.0
 DEAD_MS: Final = 5000  # without an acknowledgement for so long the peer is gone
+# TCP_NOTSENT_LOWAT keeps the kernel from hoarding: what waits is ours to replace by newer frames.
+OPTIONS: Final = (
+    ("TCP_NODELAY", 1),
+    ("TCP_KEEPIDLE", 2),
+    ("TCP_KEEPINTVL", 1),
+    ("TCP_USER_TIMEOUT", DEAD_MS),
+    ("TCP_NOTSENT_LOWAT", PENDING_BYTES),
+)
 
 
 class TcpPort:
@@ -49,10 +67,9 @@ class TcpPort:
 
     def _begin(self, sock: socket.socket, address: tuple[str, int]) -> None:
         sock.setblocking(False)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPINTVL", 1), ("TCP_USER_TIMEOUT", DEAD_MS)):
-            if hasattr(socket, option):
+        for option, value in OPTIONS:
+            if hasattr(socket, option):  # not every system has all of them
                 sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
         self._client, self._peer = sock, shown(address)
 
