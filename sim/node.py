@@ -21,7 +21,7 @@ from sim.autopilot.readings import Airframe, AutopilotConfig
 from sim.autopilot.readings import GpsFix as ReceiverFix
 from sim.config import SimConfig
 from sim.sensors.baro import Baro
-from sim.sensors.gps import Gps, GpsFix
+from sim.sensors.gps import Gps, GpsConfig, GpsFix
 from sim.sensors.imu import Imu
 from sim.sensors.lidar import knot_stamps
 from sim.sensors.range_finder import RangeFinder
@@ -64,7 +64,7 @@ class SimNode(Node):
         self._autopilot_imu = Imu(config.autopilot_imu, seed=seed, hover_speed_rad_s=hover, stream=1)
         self._baro = Baro(config.baro, seed=seed)
         self._autopilot_baro = Baro(config.baro, seed=seed, stream=1)
-        self._gps = Gps(config.gps, seed=seed)
+        self._gps = Gps(_receiver(config), seed=seed)
         self._range = RangeFinder(config.range_finder, config.rig.range_finder, seed=seed)
         self._ranged = RangeReading(stamp_ns=0, range_m=math.nan)
         self._command: Array = np.zeros(4)
@@ -172,6 +172,10 @@ def _autopilot(config: SimConfig) -> AutopilotConfig:
         return own
     heading = 90.0 - config.start_yaw_deg if own.boot_heading_deg is None else own.boot_heading_deg
     return msgspec.structs.replace(own, boot_heading_deg=heading, parameters={**OPEN_SKY, **own.parameters})
+
+
+def _receiver(config: SimConfig) -> GpsConfig:
+    return msgspec.structs.replace(config.gps, denied=config.gps.denied and not config.open_sky)
 
 
 def _obstacles(world: World) -> Obstacles:

@@ -26,9 +26,9 @@ class Simulator:
     renderer: Renderer
     seed: int
 
-    def new_node(self) -> SimNode:
+    def new_node(self, *, signing_key: bytes | None = None) -> SimNode:
         """The vehicle at the start, as a node."""
-        return SimNode(self.config, self.world, self.renderer, seed=self.seed)
+        return SimNode(self.config, self.world, self.renderer, seed=self.seed, signing_key=signing_key)
 
     def scenery(self) -> Scenery:
         """The world as the picture shows it."""

@@ -92,6 +92,11 @@ class Estimator:
         return self._work[ekf.SHAKE : ekf.SHAKE + 3]
 
     @property
+    def has_compass(self) -> bool:
+        """It knew its heading at boot."""
+        return self._boot_heading is not None
+
+    @property
     def xy_valid(self) -> bool:
         """Horizontal position and velocity are usable: something was fused recently enough."""
         return self.attitude_valid and self.yaw_aligned and self._silent_ns(0, 1) < self._no_aid_ns()

@@ -32,7 +32,7 @@ RATES_HZ: Final[dict[str, float]] = {
     "ESTIMATOR_STATUS": 1, "VIBRATION": 0.5, "HOME_POSITION": 0.5, "EXTENDED_SYS_STATE": 5, "ODOMETRY": 30,
     "CURRENT_MODE": 0.5,
 }  # fmt: skip
-GYRO, ACCEL, BARO, GPS, BATTERY, PREARM, VISION = 1, 2, 8, 32, 1 << 25, 1 << 28, 128  # MAV_SYS_STATUS_SENSOR
+GYRO, ACCEL, MAG, BARO, GPS, BATTERY, PREARM, VISION = 1, 2, 4, 8, 32, 1 << 25, 1 << 28, 128  # MAV_SYS_STATUS_SENSOR
 IMU_FIELDS: Final = 0x3F | 1 << 9 | 1 << 11  # HIGHRES_IMU: accel, gyro, pressure and its altitude
 NAN: Final = math.nan
 
@@ -222,8 +222,9 @@ class Telemetry:
 
     def _sys_status(self) -> bytes:
         e, c = self._estimator, self._commander
-        present = GYRO | ACCEL | BARO | VISION | BATTERY | PREARM | (GPS if self._readings.gps else 0)
-        health = GYRO | ACCEL | BATTERY | (BARO if math.isfinite(e.baro_altitude) else 0)
+        compass = MAG if e.has_compass else 0
+        present = GYRO | ACCEL | BARO | VISION | BATTERY | PREARM | compass | (GPS if self._readings.gps else 0)
+        health = GYRO | ACCEL | compass | BATTERY | (BARO if math.isfinite(e.baro_altitude) else 0)
         health |= (VISION if e.xy_valid else 0) | (0 if c.refusals(self._clock.ns) else PREARM)
         health |= GPS if self._readings.gps and self._readings.gps.fix_type >= 3 else 0
         millivolts = _u16(1e3 * self._readings.battery_v)
