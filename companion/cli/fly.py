@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from companion.cli import simulation
+from companion.cli.flight_input import read_text, stack_config
 from companion.cli.outcome import Outcome, print_outcome, write_outcome
-from companion.config import Config, apply_overrides, dump_config, load_config
-from companion.core.errors import InputError
+from companion.config import Config, dump_config
 from companion.core.node import Node
 from companion.mission.model import Mission, parse_mission
 from companion.report.tracks import Tracks
@@ -71,11 +71,11 @@ def fly(
     Exit code 0: completed without contact; 1: the flight failed; 2: wrong input.
     """
     overrides = tuple(set_ or ())
-    parsed = parse_mission(_read(mission), file=str(mission))
+    parsed = parse_mission(read_text(mission), file=str(mission))
     request = Request(
         mission_file=mission,
         mission=parsed,
-        config=_stack_config(config, overrides),
+        config=stack_config(config, overrides),
         overrides=overrides,
         world=world,
         seed=seed,
@@ -125,7 +125,7 @@ def _header(request: Request, stack: list[Node]) -> Header:
         group="lockstep",
         nodes=tuple(name(node) for node in stack),
         seed=request.seed,
-        mission=_read(request.mission_file),
+        mission=read_text(request.mission_file),
         config=dump_config(request.config),
     )
 
@@ -164,17 +164,3 @@ def _show(bar: Progress, task: object, where: Where, tracks: Tracks) -> None:
     near = min((m.clearance_m for m in tracks.truth[-50:]), default=float("nan"))
     info = f"{where.time_s:6.1f} s simulated   {speed:4.1f} m/s   nearest branch {near:4.1f} m"
     bar.update(task, description=step, total=max(total, 1), completed=count, info=info)  # type: ignore[arg-type]
-
-
-def _stack_config(file: Path | None, overrides: tuple[str, ...]) -> Config:
-    base = load_config(_read(file), file=str(file)) if file else Config()
-    return apply_overrides(base, [o for o in overrides if not o.startswith("sim.")])
-
-
-def _read(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read: {error.__class__.__name__}", file=str(file), valid="a YAML text file"
-        ) from error

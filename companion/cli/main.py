@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 import companion
-from companion.cli import config, doctor, fly, mavlink, mission, odometry, replay, sim
+from companion.cli import config, doctor, fly, mavlink, mission, odometry, replay, run, sim
 from companion.core.errors import CompanionError
 
 app = typer.Typer(
@@ -18,6 +18,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("fly")(fly.fly)
+app.command("run")(run.run)
 app.command("sim")(sim.sim)
 app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)

@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
 
@@ -20,10 +21,14 @@ from companion.core import topics
 from companion.core.errors import CompanionError
 from companion.core.messages import GroundTruth, MavlinkBytes
 from companion.core.node import Topic
+from companion.runtime.bus.attach import BusOutlet
+from companion.runtime.bus.graph import Graph
+from companion.runtime.bus.session import ENDPOINT, open_session
 from companion.runtime.clock import Clock
 from companion.runtime.live import Outlet
 from companion.runtime.paced import Pace, Paced
 from companion.runtime.ports.endpoint import Endpoint, parse_endpoint
+from companion.runtime.ports.key_file import load_key
 from companion.runtime.ports.mavlink_link import Link, open_link
 from sim.node import SimNode
 from sim.rehearsal import rehearse
@@ -42,6 +47,7 @@ class SimRequest(msgspec.Struct, frozen=True, kw_only=True):
     overrides: tuple[str, ...]
     name: str
     for_s: float
+    key: bytes | None = None  # MAVLink signing
 
 
 class SimSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,7 +83,9 @@ def sim(
     gcs: Annotated[str, typer.Option(help="A second one, as for a ground station.")] = "udp://127.0.0.1:14550",
     set_: Annotated[list[str] | None, typer.Option("--set", help="Override, such as sim.wind.mean_m_s=3.")] = None,
     gps: Annotated[bool, typer.Option(help="Compass and GPS: it flies without a companion, too.")] = False,
-    name: Annotated[str, typer.Option(help="Name of the vehicle.")] = "drone1",
+    name: Annotated[str, typer.Option(help="Name of the vehicle on the bus.")] = "drone1",
+    bus: Annotated[str, typer.Option(help="Zenoh endpoint of the bus; '' for none.")] = ENDPOINT,
+    key: Annotated[Path | None, typer.Option(help="Key file of MAVLink signing, made by companion keys.")] = None,
     for_s: Annotated[float, typer.Option(min=0, help="End after so many simulated seconds [at Ctrl-C].")] = 0.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
@@ -95,15 +103,27 @@ def sim(
         overrides=("sim.open_sky=true", *overrides) if gps else overrides,
         name=name,
         for_s=for_s,
+        key=load_key(key) if key else None,
     )
-    console = Console(quiet=quiet or as_json, stderr=as_json)
+    console = Console(quiet=quiet, stderr=as_json, soft_wrap=True, highlight=False)
     with _stopping() as stopped:
         try:
-            summary = simulate(request, console, clock=Clock.of_host(), stopped=stopped)
+            with on_bus(bus, name) as outlets:
+                summary = simulate(request, console, clock=Clock.of_host(), stopped=stopped, outlets=outlets)
         except KeyboardInterrupt:
             console.print("stopped before it was ready")
             return
     _show(summary, console, as_json=as_json)
+
+
+@contextmanager
+def on_bus(endpoint: str, vehicle: str) -> Iterator[list[Outlet]]:
+    """The bus as an outlet of the simulated vehicle's sensors; none for ''."""
+    if not endpoint:
+        yield []
+        return
+    with open_session("first", endpoint=endpoint) as session, Graph(session) as graph:
+        yield [BusOutlet(graph, {"SimNode": SimNode.publishes}, vehicle=vehicle)]
 
 
 class Stopped:
@@ -141,7 +161,7 @@ def simulate(
     with opened as simulator, ExitStack() as stack:
         with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):
             _warm(simulator)
-        node, watch, wire = simulator.new_node(), Watch(), Wire()
+        node, watch, wire = simulator.new_node(signing_key=request.key), Watch(), Wire()
         pace = Pace(clock.now_ns(), speed=request.speed)
         paced = Paced([node], pace=pace, outlets=[wire, watch, *outlets])
         for endpoint in request.links:

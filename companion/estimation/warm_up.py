@@ -54,7 +54,7 @@ def _sweep(stamp_ns: int, rng: np.random.Generator) -> LidarScan:
         [centres + 0.2 * np.column_stack([np.cos(turns), np.sin(turns)]), rng.uniform(0, 6, 4000)]
     )
     points: Array32 = np.concatenate([ground, pillars]).astype(np.float32)
-    up = rng.normal(size=(500, 3)) + [0.0, 0.0, 4.0]
+    up = rng.normal((0.0, 0.0, 4.0), 1.0, (500, 3))
     dirs: Array32 = (up / np.linalg.norm(up, axis=1, keepdims=True)).astype(np.float32)
     return LidarScan(
         stamp_ns=stamp_ns,

@@ -16,6 +16,7 @@ from companion.core.node import Topic
 class Tracks:
     """Listens to a flight; `truth` is the simulator's word, everything else the stack's."""
 
+    zero_ns: int = 0  # stamp that counts as 0 s
     truth: list[GroundTruth] = field(default_factory=list)
     odometry: list[Odometry] = field(default_factory=list)
     plans: list[PlanStatus] = field(default_factory=list)
@@ -38,11 +39,11 @@ class Tracks:
 
     def true_track(self) -> Track:
         """Where the vehicle was, in the world."""
-        return _track(self.truth, "p_world", "q_world_body")
+        return _track(self.truth, "p_world", "q_world_body", self.zero_ns)
 
     def estimated_track(self) -> Track:
         """Where the stack thought it was, in odom."""
-        return _track(self.odometry, "p_odom", "q_odom_body")
+        return _track(self.odometry, "p_odom", "q_odom_body", self.zero_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +61,9 @@ class Track:
         return Track(times, p, self.q[nearest])
 
 
-def _track(messages: list[Any], position: str, attitude: str) -> Track:
+def _track(messages: list[Any], position: str, attitude: str, zero_ns: int) -> Track:
     if not messages:
         return Track(np.empty(0), np.empty((0, 3)), np.empty((0, 4)))
-    times = np.array([m.stamp_ns for m in messages]) * 1e-9
+    times = np.array([m.stamp_ns - zero_ns for m in messages]) * 1e-9
     p = np.array([getattr(m, position) for m in messages])
     return Track(times, p, np.array([getattr(m, attitude) for m in messages]))

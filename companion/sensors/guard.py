@@ -19,13 +19,14 @@ class SensorsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class StreamGuard:
-    """One stream: feed it each stamp, and ask it now and then whether it fell silent."""
+    """One stream: feed it each stamp, and ask it now and then whether it fell silent, for `deadline_s` or more."""
 
-    def __init__(self, name: str, rate_hz: float, config: SensorsConfig) -> None:
+    def __init__(self, name: str, rate_hz: float, config: SensorsConfig, *, deadline_s: float = 0.0) -> None:
         self.name = name
         self.faults = 0
         self._config = config
         self._period_ns = 1e9 / rate_hz
+        self._silent_ns = max(config.gap_periods * self._period_ns, 1e9 * deadline_s)
         self._newest_ns: int | None = None
         self._told_ns: dict[str, int] = {}
 
@@ -45,7 +46,7 @@ class StreamGuard:
 
     def silence(self, now_ns: int) -> list[str]:
         """A fault if a stream that once spoke is silent."""
-        if self._newest_ns is None or now_ns - self._newest_ns <= self._config.gap_periods * self._period_ns:
+        if self._newest_ns is None or now_ns - self._newest_ns <= self._silent_ns:
             return []
         found = [("silence", f"{self.name}: silent since {(now_ns - self._newest_ns) * 1e-9:.2f} s")]
         return self._new(found, now_ns)

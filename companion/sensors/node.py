@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from companion.core.messages import Array, Array32, CameraImage, ImuSample, LidarScan, Why
-from companion.core.node import Node, Output, every, on
+from companion.core.node import Node, Output, Topic, every, on
 from companion.core.topics import CAMERA, IMU, LIDAR, WHY
 from companion.sensors.guard import SensorsConfig, StreamGuard
 
@@ -20,9 +21,9 @@ class SensorsNode(Node):
 
     def __init__(self, config: SensorsConfig) -> None:
         self._config = config
-        self._imu = StreamGuard("IMU", IMU.rate_hz, config)
-        self._lidar = StreamGuard("LiDAR", LIDAR.rate_hz, config)
-        self._camera = StreamGuard("camera", CAMERA.rate_hz, config)
+        self._imu = _guard("IMU", IMU, config)
+        self._lidar = _guard("LiDAR", LIDAR, config)
+        self._camera = _guard("camera", CAMERA, config)
 
     @on(IMU)
     def imu(self, sample: ImuSample) -> Iterator[Output]:
@@ -53,6 +54,10 @@ class SensorsNode(Node):
     def _tell(self, stamp_ns: int, faults: list[str]) -> Iterator[Output]:
         for fault in faults:
             yield WHY(Why(stamp_ns=stamp_ns, node="SensorsNode", what="sensor fault", because=fault))
+
+
+def _guard(name: str, topic: Topic[Any], config: SensorsConfig) -> StreamGuard:
+    return StreamGuard(name, topic.rate_hz, config, deadline_s=topic.deadline_s or 0.0)
 
 
 def _bad_share(values: Array | Array32) -> float:
