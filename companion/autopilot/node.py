@@ -269,12 +269,18 @@ class AutopilotNode(Node):
         again, ended = self._desk.tick()
         for request in again:
             yield self._send(request, now_ns)
-        yield from self._results(ended, now_ns)
+        yield from self._results([self._explained(v) for v in ended], now_ns)
         for msg_id, hz in self._intervals.missing(self._vehicle.flavour, connected):
             yield self._send(self._interval_request(msg_id, hz), now_ns)
         if self._ticks % _REJECTED_EVERY_TICKS == 1:
             yield from self._tell_rejected(now_ns)
         yield self._report(now_ns)
+
+    def _explained(self, verdict: Verdict) -> Verdict:
+        if self._signing is not None or not self._parser.signed:
+            return verdict
+        hint = "the autopilot signs its messages: it may want ours signed, with its key"
+        return verdict._replace(reason=f"{verdict.reason}; {hint}")
 
     def _interval_request(self, msg_id: int, hz: float) -> codec.CommandLong:
         system, component = self._target
