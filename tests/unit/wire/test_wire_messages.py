@@ -2,8 +2,7 @@
 
 import dataclasses
 import math
-import typing
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,40 +17,6 @@ from companion.runtime.wire import Codec, WireError, codec_of, wire_type
 
 STAMP = 1_764_000_000_123_456_789
 OWN = [t for t in topics.ALL if t.ros_type.startswith("understory_msgs/")]
-FIXED = {  # shapes of arrays that are no (3,)
-    "covariance": (18, 18), "information": (6, 6), "gradient": (6,), "pose_variance": (6,),
-    "next_p_odom": (2, 3), "plan_p_odom": (7, 3), "speed": (7,), "points_body": (9, 3), "miss_dirs_body": (0, 3),
-    "state": (2, 3, 4), "distance_m": (2, 3, 4), "unknown_distance_m": (2, 3, 4), "ground_z_odom": (2, 3),
-}  # fmt: skip
-
-
-def random_message(kind: type[Any], rng: np.random.Generator) -> Any:
-    """Values of the right kinds and shapes; NaN and extremes among the numbers."""
-    hints = typing.get_type_hints(kind)
-    return m.freeze(kind(**{f.name: _random(kind, f.name, hints[f.name], rng) for f in dataclasses.fields(kind)}))
-
-
-def _random(kind: type[Any], name: str, hint: Any, rng: np.random.Generator) -> Any:
-    if name == "stamp_ns":
-        return STAMP + int(rng.integers(0, 10**9))
-    if typing.get_origin(hint) is Literal:
-        choices = typing.get_args(hint)
-        return choices[rng.integers(len(choices))]
-    simple = {bool: bool(rng.integers(2)), int: int(rng.integers(-(2**63), 2**63 - 1)), str: "ä" * rng.integers(4)}
-    simple |= {float: float(rng.choice([math.nan, -0.0, rng.normal()])), bytes: rng.bytes(rng.integers(9))}
-    if hint in simple:
-        return simple[hint]
-    if dataclasses.is_dataclass(hint):
-        return random_message(hint, rng)  # type: ignore[arg-type]
-    shape = (7, 3) if (kind, name) == (m.Trajectory, "p_odom") else FIXED.get(name, (3,))
-    shape = (4,) if name.startswith("q_") else shape
-    values = rng.normal(size=shape)
-    if values.size:
-        values.flat[0] = math.nan
-    dtype = {"Array32": np.float32, "Bytes2D": np.uint8}.get("")
-    del dtype
-    scalar = typing.get_args(typing.get_args(hint)[1])[0] if typing.get_args(hint) else np.float64
-    return rng.integers(0, 3, shape).astype(scalar) if scalar is np.uint8 else values.astype(scalar)
 
 
 def same(a: Any, b: Any) -> None:
@@ -70,7 +35,7 @@ def same(a: Any, b: Any) -> None:
 
 
 @pytest.mark.parametrize("topic", OWN, ids=lambda t: t.name)
-def test_own_messages_round_trip(topic: Topic[Any]) -> None:
+def test_own_messages_round_trip(topic: Topic[Any], random_message: Any) -> None:
     codec, rng = codec_of(topic), np.random.default_rng(3)
     for _ in range(5):
         message = random_message(topic.type, rng)
@@ -87,7 +52,7 @@ def test_text_and_class_have_the_same_fields(topic: Topic[Any]) -> None:
     assert wire == ["header", *named[1:]] and named[0] == "stamp_ns"
 
 
-def test_quaternions_are_xyzw_on_the_wire_and_frames_are_named() -> None:
+def test_quaternions_are_xyzw_on_the_wire_and_frames_are_named(random_message: Any) -> None:
     message = random_message(m.GroundTruth, np.random.default_rng(1))
     value = codec_of(topics.TRUTH).type.decode(codec_of(topics.TRUTH).encode(message))
     q = value["q_world_body"]
