@@ -197,6 +197,8 @@ def _copy_or_nan(v: Array, fresh: bool) -> Array:
 class _Text:
     """STATUSTEXT, joined again when it came in chunks (same id, rising chunk_seq)."""
 
+    LENGTH_MAX: Final = 500
+
     def __init__(self) -> None:
         self.newest = ""
         self._id = 0
@@ -204,7 +206,7 @@ class _Text:
     def take(self, message: Any) -> None:
         text = message.text
         if message.id and message.id == self._id and message.chunk_seq:
-            self.newest += text
+            self.newest = (self.newest + text)[: self.LENGTH_MAX]
         else:
             self.newest = text
         self._id = message.id
