@@ -117,6 +117,7 @@ class AutopilotNode(Node):
         self._neighbours = Neighbours(system=config.system, component=config.component)
         self._newsroom = Newsroom()
         self._ticks = self._texts = self._rejected_told = 0
+        self._barred = ""  # why setpoints do not go out
         self._reported: State | None = None
         self._odometry_due_ns: int | None = None
         self._odometry_resets = -1
@@ -174,7 +175,7 @@ class AutopilotNode(Node):
         if self._authority.saw(state.mode, armed=state.armed, now_ns=now_ns):
             reason = self._authority.reason
             yield from self._results(self._desk.cancel(reason), now_ns)
-            yield self._why(now_ns, "stop setpoints and commands", reason)
+            yield self._why(now_ns, "command no more", reason)
             yield from self._tell(News(Severity.WARNING, f"{state.mode} is not ours, setpoints stop"), now_ns)
 
     def _on_double(self, frame: Frame, now_ns: int) -> Outputs:
@@ -195,14 +196,27 @@ class AutopilotNode(Node):
 
     @on(SETPOINT)
     def on_setpoint(self, setpoint: Setpoint) -> Outputs:
-        """Pass the demand on; one that controls nothing is dropped, and all while it is not our flight."""
-        now_ns = setpoint.stamp_ns
-        doubled = self._neighbours.present(now_ns) and not self._authority.flying
-        if self._authority.reason or doubled:
+        """Pass the demand on, if the flight is ours or may become so; one that controls nothing is dropped."""
+        now_ns, before = setpoint.stamp_ns, self._barred
+        self._barred = self._setpoints_barred(now_ns)
+        if self._barred and self._barred != before:
+            yield self._why(now_ns, "send no setpoints", self._barred)
+        if self._barred:
             return
         message = setpoint_message(setpoint, self._target, self._vehicle.flavour)
         if message is not None:
             yield self._send(message, now_ns)
+
+    def _setpoints_barred(self, now_ns: int) -> str:
+        """Why no setpoint goes out now. On the ground they do, since PX4 wants a stream before OFFBOARD."""
+        if self._authority.flying:
+            return ""
+        if self._authority.reason:
+            return self._authority.reason
+        if self._neighbours.present(now_ns):
+            return self._neighbours.reason
+        # As after a restart of ours in flight: without setpoints the autopilot's failsafe brings it home.
+        return "it flies, and not because we asked" if self._vehicle.airborne else ""
 
     @on(ODOMETRY)
     def on_odometry(self, odometry: Odometry) -> Outputs:

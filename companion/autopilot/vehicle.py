@@ -165,6 +165,11 @@ class Vehicle:
             self._text.newest,
         )
 
+    @property
+    def airborne(self) -> bool:
+        """Armed and not on the ground."""
+        return self._armed and not self._landed()
+
     def _landed(self) -> bool:
         """Without EXTENDED_SYS_STATE, disarmed rotors are the evidence."""
         return self._landed_state == _ON_GROUND if self._landed_state else not self._armed

@@ -361,4 +361,7 @@ def test_senseless_content_from_the_target_breaks_nothing():
         if i % 10 == 0:
             flight.tick(now).feed(SETPOINT, setpoint(now)).feed(ODOMETRY, odometry(now))
     assert 0.0 <= flight.status.battery_fraction <= 1.0
-    assert len(flight.sent(codec.SetPositionTarget)) == 400
+    flight.sent()
+    end = S + 4000 * 10 * MS
+    flight.hear(end, heartbeat()).feed(SETPOINT, setpoint(end))  # disarmed: it may stream again
+    assert len(flight.sent(codec.SetPositionTarget)) == 1

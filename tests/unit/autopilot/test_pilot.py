@@ -77,8 +77,11 @@ def test_a_pilot_who_takes_over_gets_neither_setpoints_nor_commands():
     assert setpoints(flight, S) == 1
     flight.hear(2 * S, heartbeat(POSITION, armed=True))
     assert texts(flight) == ["companion: POSITION is not ours, setpoints stop"]
-    assert [w.because for w in flight.published(WHY)] == ["the pilot or the autopilot took over: mode POSITION"]
-    assert setpoints(flight, 2 * S) == 0
+    assert setpoints(flight, 2 * S) == setpoints(flight, 2 * S) == 0
+    assert [(w.what, w.because) for w in flight.published(WHY)] == [
+        ("command no more", "the pilot or the autopilot took over: mode POSITION"),
+        ("send no setpoints", "the pilot or the autopilot took over: mode POSITION"),
+    ]
     for kind in ("offboard", "arm", "land", "hold"):
         flight.feed(VEHICLE_COMMAND, command(kind, 2 * S))
     assert flight.sent(codec.CommandLong) == []
@@ -95,6 +98,14 @@ def test_what_waits_for_an_answer_is_not_sent_again_over_the_pilots_head():
     for i in range(30):
         flight.tick(S + i * 100 * MS)
     assert [m for m in flight.sent(codec.CommandLong) if m.command == SET_MODE] == []
+
+
+def test_restarted_in_flight_it_leaves_the_vehicle_to_its_failsafe():
+    """Streaming again would keep the vehicle in OFFBOARD, with no mission that ever brings it down."""
+    flight = ready_flight().hear(S, heartbeat(OFFBOARD, armed=True), landed(2))
+    assert setpoints(flight, S) == setpoints(flight, 2 * S) == 0
+    assert [w.because for w in flight.published(WHY)] == ["it flies, and not because we asked"]
+    assert setpoints(flight.hear(3 * S, landed(1)), 3 * S) == 1
 
 
 def test_it_is_over_when_the_vehicle_disarms():
@@ -218,7 +229,7 @@ def test_beside_a_second_companion_nothing_is_commanded():
     assert flight.sent(codec.CommandLong) == [] and refusals(flight) == [("offboard", reason), ("arm", reason)]
     assert setpoints(flight, S) == 0
     other(2 * S, 78, flight)
-    assert len(flight.published(WHY)) == 1  # said once
+    assert [w.what for w in flight.published(WHY)] == ["refuse to command", "send no setpoints"]  # said once
     later = 2 * S + 5 * S + 1
     flight.hear(later, heartbeat(), position()).feed(VEHICLE_COMMAND, command("arm", later))
     assert [m.command for m in flight.sent(codec.CommandLong)] == [400] and setpoints(flight, later) == 1
