@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 import companion
-from companion.cli import config, doctor, fly, mavlink, mission, odometry, replay, run, sim
+from companion.cli import config, doctor, export, fly, mavlink, mission, odometry, replay, run, sim
 from companion.core.errors import CompanionError
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ app.command("fly")(fly.fly)
 app.command("run")(run.run)
 app.command("sim")(sim.sim)
 app.command("replay")(replay.replay)
+app.command("export")(export.export)
 app.command("doctor")(doctor.doctor)
 app.command("odometry")(odometry.odometry)
 

@@ -41,4 +41,9 @@ def rebuild(header: Header, overrides: Sequence[str] = ()) -> list[Node]:
     """Fresh nodes as at the beginning of the log; raises InputError for a wrong override."""
     config: Config = apply_overrides(load_config(header.config, file="config of the log"), overrides)
     mission = parse_mission(header.mission, file="mission of the log")
-    return build(config, mission, seed=header.seed, only=[kind for kind in NODES if kind.__name__ in header.nodes])
+    return build(config, mission, seed=header.seed, only=kinds_of(header))
+
+
+def kinds_of(header: Header) -> list[type[Node]]:
+    """The nodes' classes, in the order of the data flow."""
+    return [kind for kind in NODES if kind.__name__ in header.nodes]

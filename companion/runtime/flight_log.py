@@ -7,14 +7,12 @@ The file's format: `companion.runtime.log_file`.
 from __future__ import annotations
 
 import hashlib
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from xxhash import xxh3_128_digest
-
 from companion.core.node import Topic
-from companion.runtime.codec import encode, encode_into
+from companion.runtime.codec import summed
 from companion.runtime.log_file import Header, LogFile, read_log
 
 
@@ -33,7 +31,6 @@ class FlightLog:
         self._hash = hashlib.sha256()
         self._number = -1
         self._newest_ns = 0
-        self._scratch: defaultdict[str, bytearray] = defaultdict(bytearray)  # by topic: sizes repeat
 
     @property
     def flight_hash(self) -> str:
@@ -49,15 +46,14 @@ class FlightLog:
     def published(self, now_ns: int, source: str, topic: Topic[Any], message: Any) -> int:
         """Hash a message, store it where its topic is recorded; returns its number."""
         stored = topic.recorded or self._store_all or (self._record and self._is_outside(source))
-        data = encode(message) if stored else encode_into(message, self._scratch[topic.name])
-        digest = xxh3_128_digest(data)
+        data, digest, size = summed(message, stored=stored)
         # Maps are 100 MB per flown second: a fast digest of each message, a strong hash over the digests.
-        self._hash.update(f"{now_ns} {source} {topic.name} {len(data)} {digest.hex()} ".encode())
+        self._hash.update(f"{now_ns} {source} {topic.name} {size} {digest.hex()} ".encode())
         self.counts[topic.name] += 1
         self._number += 1
         self._newest_ns = now_ns
         if self._file:
-            self._file.message(now_ns, source, topic.name, data if stored else None, digest)
+            self._file.message(now_ns, source, topic.name, data, digest)
         return self._number
 
     def fed(self, now_ns: int, node: str, event: str, number: int) -> None:

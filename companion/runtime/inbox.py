@@ -11,10 +11,8 @@ from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any
 
-from xxhash import xxh3_128_digest
-
 from companion.core.node import Topic
-from companion.runtime.codec import encode, encode_into
+from companion.runtime.codec import summed
 from companion.runtime.log_file import Header, LogFile, Store
 
 OUTSIDE = "outside"  # the source of what came over the bus or the link
@@ -38,7 +36,6 @@ class InboxLog:
         self._bulk = 0
         self._number = -1
         self._newest_ns = 0
-        self._scratch: dict[str, bytearray] = {}
         self._thread = Thread(target=self._run, name="inbox log", daemon=True)
         self._thread.start()
 
@@ -98,8 +95,8 @@ class InboxLog:
 
     def _message(self, time_ns: int, source: str, topic: Topic[Any], message: Any) -> None:
         stored = source == OUTSIDE or self._store == "all" or (self._store == "recorded" and topic.recorded)
-        data = encode(message) if stored else encode_into(message, self._scratch.setdefault(topic.name, bytearray()))
-        self._file.message(time_ns, source, topic.name, data if stored else None, xxh3_128_digest(data))
+        data, digest, _ = summed(message, stored=stored)
+        self._file.message(time_ns, source, topic.name, data, digest)
 
 
 def inbox_path(folder: Path, group: str) -> Path:

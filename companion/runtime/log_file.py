@@ -94,7 +94,7 @@ class LogFile:
         """The first entry."""
         self._write((HEADER, msgspec.to_builtins(header)))
 
-    def message(self, time_ns: int, source: str, topic: str, payload: bytes | bytearray | None, digest: bytes) -> None:
+    def message(self, time_ns: int, source: str, topic: str, payload: bytes | None, digest: bytes) -> None:
         """One message."""
         self._write((MESSAGE, time_ns, source, topic, payload, digest))
 

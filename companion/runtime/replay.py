@@ -1,6 +1,6 @@
 """Feed the nodes of a logged process what they were fed, and compare what comes out, byte for byte.
 
-    replay = Replay(read_header(path), path)
+    replay = Replay(path, rebuild(read_header(path)))
     for time_ns in replay.run():
         ...
     assert replay.identical
@@ -25,10 +25,11 @@ from companion.core import topics
 from companion.core.errors import InputError
 from companion.core.messages import freeze
 from companion.core.node import Node, Output
-from companion.runtime.codec import decode, encode
+from companion.runtime.codec import decode, digest
 from companion.runtime.lockstep import name
 from companion.runtime.log_file import End, Fed, Header, LogDamaged, Message, entries
 from companion.runtime.message_diff import TopicDifferences, differences
+from companion.runtime.replay_plan import blocked_nodes, survey, with_producers
 from companion.runtime.replay_report import Difference, NodeReport
 
 RECORD_HINT = "a flight flown with --record"
@@ -38,8 +39,8 @@ UNFINISHED = 2  # a node's last deliveries whose outputs the end of the log may 
 class Listener(Protocol):
     """Hears every message of a replay, also what was computed again."""
 
-    def heard(self, time_ns: int, topic_name: str, message: Any) -> None:
-        """One message, in the order of the log; it is None where nobody knows it."""
+    def heard(self, entry: Message, message: Any) -> None:
+        """One message and its entry, in the order of the log; None where nobody knows it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -76,9 +77,9 @@ class Replay:
         self.end_reason: str | None = None  # None: the log has no end, its process was killed
         self.end_ns = 0
         self._chain, self._listener = chain, listener
-        deliveries, unstored = _survey(path)
-        self.blocked = _blocked(nodes, unstored)  # node -> (topic that is not stored, its source)
-        wanted = _with_producers(only, nodes, unstored) if only else {name(n) for n in nodes} - self.blocked.keys()
+        deliveries, unstored = survey(path)
+        self.blocked = blocked_nodes(nodes, unstored)  # node -> (topic that is not stored, its source)
+        wanted = with_producers(only, nodes, unstored) if only else {name(n) for n in nodes} - self.blocked.keys()
         if only in self.blocked:
             topic, source = self.blocked[only]
             raise InputError(
@@ -162,7 +163,7 @@ class Replay:
         if message is None and entry.payload is not None and (self._listener or self._uses[number]):
             message = _decoded(entry)
         if self._listener:
-            self._listener.heard(entry.time_ns, entry.topic, message)
+            self._listener.heard(entry, message)
         if message is None or not self._uses[number]:
             return
         self._messages[number] = (message, message if twin is None else twin)
@@ -180,7 +181,7 @@ class Replay:
             seat.report.differs(_extra(entry.source, entry.time_ns, extra))
         pending = seat.pending.popleft()
         message = freeze(pending.output.message)
-        if xxh3_128_digest(encode(message)) != entry.digest:
+        if digest(message)[0] != entry.digest:
             what: tuple[str, ...] = ("its bytes differ, the log holds no more than their digest",)
             if entry.payload is not None:
                 what = tuple(map(str, differences(_decoded(entry), message))) or ("the same fields in other bytes",)
@@ -233,46 +234,6 @@ def _paired(outputs: Sequence[Output], changed: Sequence[Output]) -> list[tuple[
         queue = others[output.topic.name]
         pairs.append((output, queue.popleft() if queue else None))
     return pairs + [(None, o) for queue in others.values() for o in queue]
-
-
-def _survey(path: Path) -> tuple[list[tuple[str, int]], dict[str, set[str]]]:
-    """Every delivered message as (node, its number); source -> its topics that are not stored throughout."""
-    uses: list[tuple[str, int]] = []
-    unstored: dict[str, set[str]] = defaultdict(set)
-    for entry in entries(path):
-        if isinstance(entry, Fed) and entry.number >= 0:
-            uses.append((entry.node, entry.number))
-        elif isinstance(entry, Message) and entry.payload is None:
-            unstored[entry.source].add(entry.topic)
-    return uses, unstored
-
-
-def _blocked(nodes: Sequence[Node], unstored: dict[str, set[str]]) -> dict[str, tuple[str, str]]:
-    """Node -> (topic, its source) for those that were fed what is not stored and nobody computes again."""
-    blocked: dict[str, tuple[str, str]] = {}
-    known = {name(n) for n in nodes}
-    for _ in nodes:  # as often as the longest chain of nodes
-        for node in nodes:
-            for source, silent in unstored.items():
-                missing = sorted(silent & node.handlers.keys())
-                if missing and (source not in known or source in blocked):
-                    blocked.setdefault(name(node), (missing[0], source))
-    return blocked
-
-
-def _with_producers(only: str, nodes: Sequence[Node], unstored: dict[str, set[str]]) -> set[str]:
-    """The node, and those that must be replayed to know what it was fed."""
-    by_name = {name(n): n for n in nodes}
-    if only not in by_name:
-        raise InputError(f"{only!r} is no node of this log", field="--node", valid=", ".join(by_name))
-    wanted, ahead = {only}, [only]
-    while ahead:
-        heard = by_name[ahead.pop()].handlers
-        for source in by_name:
-            if source not in wanted and unstored.get(source, set()) & heard.keys():
-                wanted.add(source)
-                ahead.append(source)
-    return wanted
 
 
 def _decoded(entry: Message) -> Any:

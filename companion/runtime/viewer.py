@@ -1,0 +1,175 @@
+"""Standard ROS 2 topics beside our own, so that RViz, Foxglove and Rerun show a scene: frames, paths, clouds.
+
+Frames as in ROS REP-105: `map` -> `odom` -> `base_link` -> the sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from companion.core import topics
+from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
+from companion.core.messages import (
+    Array,
+    Array32,
+    Goal,
+    LocalMap,
+    Odometry,
+    PlanStatus,
+    RegisteredScan,
+    SmoothedState,
+    Trajectory,
+    Why,
+)
+from companion.core.node import Topic
+from companion.core.rig import Mount, Rig
+
+_FLOAT32 = 7  # sensor_msgs/PointField
+_INFO = 20  # rcl_interfaces/Log
+_OCCUPIED = 2  # LocalMap.state
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One message of a standard type; `shared` topics stand outside the vehicle's namespace, as ROS wants them."""
+
+    topic: str
+    type: str
+    value: dict[str, Any]
+    shared: bool = False
+
+
+def views_of(topic: Topic[Any], message: Any) -> Iterator[View]:
+    """What a viewer is told because of one of our messages."""
+    if make := _VIEWS.get(topic.name):
+        yield from make(message)
+
+
+def sensor_frames(rig: Rig) -> View:
+    """/tf_static: where the sensors sit on `base_link`."""
+    mounts: dict[str, Mount] = {"lidar": rig.lidar, "camera": rig.camera, "range_finder": rig.range_finder}
+    parts = [
+        _transform(0, "base_link", child, mount.p_body, quaternion_from_rotation(mount.R_body_sensor))
+        for child, mount in mounts.items()
+    ]
+    return View("tf_static", "tf2_msgs/msg/TFMessage", {"transforms": parts}, shared=True)
+
+
+def _odometry(o: Odometry) -> Iterator[View]:
+    yield _frame(o.stamp_ns, "odom", "base_link", o.p_odom, o.q_odom_body)
+    R_odom_body = rotation_from_quaternion(o.q_odom_body)
+    covariance, rates = np.diag(np.concatenate([o.pose_variance[3:], o.pose_variance[:3]])), np.zeros((6, 6))
+    rates[:3, :3] = R_odom_body.T @ np.diag(o.velocity_variance) @ R_odom_body
+    value = {
+        "header": _header(o.stamp_ns, "odom"),
+        "child_frame_id": "base_link",
+        "pose": {"pose": _pose(o.p_odom, o.q_odom_body), "covariance": covariance.ravel()},
+        "twist": {
+            "twist": {
+                "linear": _xyz(R_odom_body.T @ o.v_odom),
+                "angular": _xyz(o.omega_body),
+            },
+            "covariance": rates.ravel(),
+        },
+    }
+    yield View("odom", "nav_msgs/msg/Odometry", value)
+
+
+def _smoothed(s: SmoothedState) -> Iterator[View]:
+    yield _frame(s.stamp_ns, "map", "odom", s.p_map_odom, s.q_map_odom)
+
+
+def _registered(scan: RegisteredScan) -> Iterator[View]:
+    yield View("cloud", "sensor_msgs/msg/PointCloud2", _cloud(scan.stamp_ns, "base_link", scan.points_body))
+
+
+def _map(m: LocalMap) -> Iterator[View]:
+    """Centres of the occupied cells."""
+    cells = np.argwhere(m.state == _OCCUPIED)
+    points = (m.origin_odom + (cells + 0.5) * m.resolution_m).astype(np.float32)
+    yield View("map/occupied", "sensor_msgs/msg/PointCloud2", _cloud(m.stamp_ns, "odom", points))
+
+
+def _trajectory(t: Trajectory) -> Iterator[View]:
+    yield _path("path", t.stamp_ns, t.p_odom)
+
+
+def _plan(p: PlanStatus) -> Iterator[View]:
+    yield _path("plan", p.stamp_ns, p.plan_p_odom)
+
+
+def _goal(g: Goal) -> Iterator[View]:
+    value = {"header": _header(g.stamp_ns, "odom"), "pose": {"position": _xyz(g.p_odom)}}
+    yield View("goal", "geometry_msgs/msg/PoseStamped", value)
+
+
+def _why(w: Why) -> Iterator[View]:
+    text = f"{w.what}: {w.because}"
+    value = {"stamp": _header(w.stamp_ns, "")["stamp"], "level": _INFO, "name": w.node, "msg": text}
+    yield View("rosout", "rcl_interfaces/msg/Log", value, shared=True)
+
+
+_VIEWS: dict[str, Callable[[Any], Iterator[View]]] = {
+    topics.ODOMETRY.name: _odometry,
+    topics.SMOOTHED.name: _smoothed,
+    topics.REGISTERED.name: _registered,
+    topics.LOCAL_MAP.name: _map,
+    topics.TRAJECTORY.name: _trajectory,
+    topics.PLAN.name: _plan,
+    topics.GOAL.name: _goal,
+    topics.WHY.name: _why,
+}
+
+
+def _frame(stamp_ns: int, parent: str, child: str, p: Array, q: Array) -> View:
+    value = {"transforms": [_transform(stamp_ns, parent, child, p, q)]}
+    return View("tf", "tf2_msgs/msg/TFMessage", value, shared=True)
+
+
+def _transform(stamp_ns: int, parent: str, child: str, p: Array, q: Array) -> dict[str, Any]:
+    place = {"translation": _xyz(p), "rotation": _quaternion(q)}
+    return {"header": _header(stamp_ns, parent), "child_frame_id": child, "transform": place}
+
+
+def _path(name: str, stamp_ns: int, points: Array) -> View:
+    header = _header(stamp_ns, "odom")
+    poses = [{"header": header, "pose": {"position": _xyz(p)}} for p in points]
+    return View(name, "nav_msgs/msg/Path", {"header": header, "poses": poses})
+
+
+def _cloud(stamp_ns: int, frame: str, points: Array32) -> dict[str, Any]:
+    names = enumerate(("x", "y", "z"))
+    return {
+        "header": _header(stamp_ns, frame),
+        "height": 1,
+        "width": len(points),
+        "fields": [{"name": n, "offset": 4 * k, "datatype": _FLOAT32, "count": 1} for k, n in names],
+        "is_bigendian": False,
+        "point_step": 12,
+        "row_step": 12 * len(points),
+        "data": np.ascontiguousarray(points, np.float32).reshape(-1).view(np.uint8),
+        "is_dense": True,
+    }
+
+
+def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
+    seconds, rest = divmod(stamp_ns, 1_000_000_000)
+    return {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": frame}
+
+
+def _pose(p: Array, q: Array) -> dict[str, Any]:
+    return {"position": _xyz(p), "orientation": _quaternion(q)}
+
+
+def _xyz(p: Array) -> dict[str, float]:
+    x, y, z = p.tolist()
+    return {"x": x, "y": y, "z": z}
+
+
+def _quaternion(q: Array) -> dict[str, float]:
+    w, x, y, z = q.tolist()
+    return {"x": x, "y": y, "z": z, "w": w}
