@@ -32,6 +32,7 @@ _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8
 _FLOAT32 = 7
 _POINT_BYTES = 4 * len(FIELDS)
 _FIELDS_VALUE = [{"name": n, "offset": 4 * i, "datatype": _FLOAT32, "count": 1} for i, n in enumerate(FIELDS)]
+_OWN = np.dtype([(name, "<f4") for name in FIELDS])
 _OTHER_CLOCK_S = 10.0
 _EPOCH_S, _EPOCH_NS = 1e6, 1e15  # from here on a float64 time is seconds, or nanoseconds, of an epoch
 
@@ -65,19 +66,23 @@ def scan_of(cloud: dict[str, Any]) -> LidarScan:
     names = points.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise WireError(f"a cloud without x, y, z (fields: {', '.join(names) or 'none'})")
+    if set(FIELDS) <= set(names):
+        own = points.view("<f4").reshape(-1, len(FIELDS)) if points.dtype == _OWN else _columns(points, *FIELDS)
+        return _own(stamp_ns, own)
     xyz = _columns(points, "x", "y", "z")
-    if {"age_s", "beam_x", "beam_y", "beam_z"} <= set(names):
-        return _own(stamp_ns, xyz, _columns(points, "age_s")[:, 0], _columns(points, "beam_x", "beam_y", "beam_z"))
     kept = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
     age_s, newest_ns = _ages(points[kept], stamp_ns)
     none = np.empty((0, 3), np.float32)
     return _scan(stamp_ns + newest_ns, xyz[kept], age_s, none, np.empty(0, np.float32))
 
 
-def _own(stamp_ns: int, xyz: Array32, age_s: Array32, beam: Array32) -> LidarScan:
-    miss = (beam != 0).any(axis=1)
-    hit = ~miss
-    return _scan(stamp_ns, xyz[hit], age_s[hit], beam[miss], age_s[miss])
+def _own(stamp_ns: int, table: Array32) -> LidarScan:
+    miss = (table[:, 4] != 0) | (table[:, 5] != 0) | (table[:, 6] != 0)
+    returns = len(table) - int(np.count_nonzero(miss))
+    if miss[:returns].any():  # someone mixed them
+        table = table[np.argsort(miss, kind="stable")]
+    hits, misses = table[:returns], table[returns:]
+    return _scan(stamp_ns, hits[:, :3].copy(), hits[:, 3].copy(), misses[:, 4:].copy(), misses[:, 3].copy())
 
 
 def _scan(stamp_ns: int, points: Array32, age_s: Array32, misses: Array32, miss_age_s: Array32) -> LidarScan:

@@ -17,7 +17,6 @@ from companion.runtime.wire.values import complete
 Payload = bytes | bytearray | memoryview
 _HEADER = b"\x00\x01\x00\x00"  # CDR, little endian, no options
 _ORDERS: tuple[Order, ...] = (">", "<")  # second byte of the header; others are encodings that ROS 2 does not use
-_SLACK_BYTES = 7  # padding that a writer may leave behind
 
 
 class Types:
@@ -101,19 +100,21 @@ class WireType:
         return b"".join(out)
 
     def decode(self, payload: Payload) -> dict[str, Any]:
-        """The value of a CDR payload of either byte order; WireError if it is malformed."""
+        """The value of a CDR payload of either byte order; WireError if it is malformed.
+
+        Bytes behind the value are ignored: Fast CDR leaves some, as many as its estimate of
+        the size was too large.
+        """
         view = memoryview(payload).toreadonly().cast("B")
         size = len(view) - 4
         if size < 0 or view[0] or view[1] > 1:
             raise WireError(f"{self.name}: no CDR header in a payload of {len(view)} bytes")
         try:
-            value, end = (self._read if view[1] else self._read_big)(view[4:], 0, size)
+            value, _ = (self._read if view[1] else self._read_big)(view[4:], 0, size)
         except WireError as error:
             raise WireError(f"{self.name}: {error}") from None
         except MALFORMED as error:
             raise WireError(f"{self.name}: payload of {len(view)} bytes is malformed: {error}") from None
-        if end < size - _SLACK_BYTES:
-            raise WireError(f"{self.name}: {size - end} bytes behind the message")
         return value
 
     @cached_property

@@ -205,6 +205,12 @@ def test_a_malformed_payload_is_a_wire_error(name: str, payload: str, match: str
         wire_type(name).decode(bytes.fromhex(payload))
 
 
+def test_bytes_behind_the_value_are_ignored() -> None:
+    """Fast CDR leaves 24 of them behind a ParameterEvent."""
+    wire = wire_type("rcl_interfaces/msg/ParameterEvent")
+    assert plain(wire.decode(wire.encode({"node": "/a"}) + bytes(24)))["node"] == "/a"
+
+
 def test_bounds_hold_on_the_wire_too(zoo: WireType) -> None:
     loose = foreign_type("zoo_msgs/msg/Zoo", ZOO.replace("<=5", "").replace("<=3", "").replace("<=2", ""))
     for name, value in (("short", "123456"), ("few", [1, 2, 3, 4]), ("shorts", ["", "", ""]), ("corners", [{}] * 3)):

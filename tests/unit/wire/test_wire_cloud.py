@@ -40,6 +40,15 @@ def test_sweep_round_trip(returns: int, misses: int) -> None:
         assert b.flags.c_contiguous and b.flags.aligned and not b.flags.writeable
 
 
+def test_a_mixed_sweep_is_sorted_again() -> None:
+    scan = sweep(3, 2)
+    value = CODEC.type.decode(CODEC.encode(scan))
+    mixed = value["data"].view(np.float32).reshape(5, 7)[[3, 0, 1, 4, 2]]
+    again = CODEC.decode(CODEC.type.encode(value | {"data": mixed.tobytes()}))
+    for name in scan.__slots__[1:]:
+        assert getattr(scan, name).tobytes() == getattr(again, name).tobytes()
+
+
 def test_a_sweep_is_a_plain_cloud_for_others() -> None:
     value = CODEC.type.decode(CODEC.encode(sweep(3, 2)))
     assert [f["name"] for f in value["fields"]] == ["x", "y", "z", "age_s", "beam_x", "beam_y", "beam_z"]
