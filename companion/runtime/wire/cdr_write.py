@@ -200,7 +200,8 @@ def _numbers(value: Any, dtype: np.dtype[Any], count: int | None, bound: int) ->
 
 
 def _structs(value: Any, dtype: Any, plain: Any, count: int | None, bound: int) -> Any:
-    if value.dtype != dtype and not (value.dtype == plain and value.ndim == 2 and value.shape[1] == len(dtype.names)):
+    rows = plain is not None and value.dtype == plain and value.ndim == 2 and value.shape[1] == len(dtype.names)
+    if value.dtype != dtype and not rows:
         raise UnfitError
     if len(value) != count if count is not None else bound and len(value) > bound:
         raise UnfitError

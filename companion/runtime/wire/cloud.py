@@ -9,8 +9,8 @@ and as drivers are known to write it:
 - `age_s`: seconds before the stamp, ours;
 - `time`, `t`, `timestamp`, `time_stamp`, `offset_time`, `time_offset`: float32 seconds after the stamp
   (Velodyne; negative if the stamp is the sweep's end), integers nanoseconds after it (Ouster
-  `t`, Livox `offset_time`), float64 or uint64 the time itself, seconds or nanoseconds of an
-  epoch (Hesai, RoboSense; Livox `timestamp`), told apart by their size.
+  `t`, Livox `offset_time`), float64 the time itself, seconds or nanoseconds of an epoch (Hesai,
+  RoboSense; Livox `timestamp`) or seconds after the stamp, told apart by their size.
 The scan's stamp moves to its newest point if that is later, since ours is the sweep's end. A
 clock that is over 10 s from the header's is another clock: then the newest point is at the stamp.
 Without a time field the age is 0.

@@ -23,7 +23,9 @@ INTEGERS: dict[str, tuple[int, int]] = {
 }
 PRIMITIVES = ("bool", *INTEGERS, "float32", "float64")
 
-_TYPE = re.compile(r"(?P<base>[A-Za-z][\w/]*)(?:<=(?P<text_cap>\d+))?(?P<array>\[(?P<upto><=)?(?P<cap>\d*)\])?$")
+_TYPE = re.compile(
+    r"(?P<base>[A-Za-z][\w/]*)(?:<=(?P<text_cap>[0-9]{1,9}))?(?P<array>\[(?P<upto><=)?(?P<cap>[0-9]{0,9})\])?$"
+)
 _FIELD_NAME = re.compile(r"[a-z](?:_?[a-z0-9])*_?$")  # rosidl's rule, and its own trailing `_`
 _CONSTANT_NAME = re.compile(r"[A-Z](?:_?[A-Z0-9])*$")
 _CONSTANT = re.compile(r"(?P<type>\S+)\s+(?P<name>\w+)\s*=\s*(?P<value>.*)$")

@@ -27,6 +27,7 @@ CODES = {  # of one primitive: struct code, NumPy type
     **{"float32": ("f", "f4"), "float64": ("d", "f8")},
 }
 Path = tuple[str, ...]
+_LARGEST_REGULAR = 1 << 20  # bytes of one element that a NumPy struct is made for
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +152,7 @@ def regular_dtype(library: Library, name: str) -> np.dtype[Any] | None:
     if not leaves:
         return None
     widest = max(size for size, _ in leaves)
-    if leaves[0][0] != widest:
+    if leaves[0][0] != widest or sum(size * count for size, count in leaves) > _LARGEST_REGULAR:
         return None
     dtype, _, end = _packed(library, name, 0)
     return None if end % widest else dtype

@@ -11,6 +11,7 @@ from companion.runtime.wire.idl import Field, FieldType, Struct, parse_msg, pars
 
 INTERFACES = Path(__file__).parent / "interfaces"
 _RULE = "=" * 80  # between the parts of a ros2msg schema, as MCAP wants it
+_DEEPEST, _MOST_FIELDS = 40, 20_000  # a peer's schema may be made to do harm
 _HALVES = ("_Request", "_Response", "_Event")
 
 
@@ -33,7 +34,7 @@ class Library:
 
     def references(self, name: str) -> tuple[str, ...]:
         """Every type that `name` needs, itself not included, sorted; InputError if it contains itself."""
-        found: dict[str, None] = {}
+        found: dict[str, int] = {}
         self._collect(name, found, (name,))
         return tuple(sorted(found))
 
@@ -45,16 +46,21 @@ class Library:
             parts.append(f"{_RULE}\nMSG: {package}/{short}\n" + self.struct(needed).text.rstrip("\n"))
         return "\n".join(parts) + "\n"
 
-    def _collect(self, name: str, found: dict[str, None], path: tuple[str, ...]) -> None:
+    def _collect(self, name: str, found: dict[str, int], path: tuple[str, ...]) -> int:
+        """Add what `name` needs to `found`, each with its number of primitive fields; returns that of `name`."""
+        total = 0
         for field in self.struct(name).fields:
             base = field.type.base
-            if not field.type.nested:
-                continue
-            if base in path:
-                raise InputError(f"{base} contains itself", field=field.name, file=name)
-            if base not in found:
-                found[base] = None
-                self._collect(base, found, (*path, base))
+            if field.type.nested:
+                if base in path or len(path) > _DEEPEST:
+                    problem = "contains itself" if base in path else "is nested too deeply"
+                    raise InputError(f"{base} {problem}", field=field.name, file=name)
+                if base not in found:
+                    found[base] = self._collect(base, found, (*path, base))
+            total += found.get(base, 1)
+        if total > _MOST_FIELDS:
+            raise InputError(f"{total} fields, {_MOST_FIELDS} is the most", file=name)
+        return total
 
     def _load(self, name: str) -> None:
         package, kind, short = _split(name)

@@ -1,6 +1,8 @@
 """Interface texts and the identity of types, against hashes that rosidl itself made."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from companion.core.errors import InputError
 from companion.runtime.wire import bundled_types, foreign_type, service_type, wire_type
@@ -122,6 +124,15 @@ def test_a_wrong_line_is_named(line: str, match: str) -> None:
         parse_msg("own_msgs/msg/A", f"int32 first\n\n{line}\n", file="a.msg")
 
 
+@given(st.text(alphabet="int32[]<=3 abAB_#'\"=.-/\n", max_size=60) | st.text(max_size=30))
+def test_any_text_parses_or_is_an_input_error(text: str) -> None:
+    try:
+        struct = parse_msg("own_msgs/msg/A", text)
+    except InputError:
+        return
+    assert len({f.name for f in struct.fields}) == len(struct.fields)
+
+
 def test_services_have_two_halves() -> None:
     request, response = parse_srv("a_srvs/srv/A", "int32 x\n---\nbool y\n")
     assert [f.name for f in request.fields + response.fields] == ["x", "y"]
@@ -140,5 +151,8 @@ def test_unknown_and_impossible_types() -> None:
     rule = "=" * 80 + "\n"
     with pytest.raises(InputError, match="a/msg/A contains itself"):
         foreign_type("a/msg/A", f"B b\n{rule}MSG: a/B\nA[] a\n")
+    chain = [f"MSG: a/T{i}\nT{i + 1}[] a\nT{i + 1}[] b\nT{i + 1}[] c\n" for i in range(12)] + ["MSG: a/T12\nint32 x\n"]
+    with pytest.raises(InputError, match=r"\d+ fields, 20000 is the most"):
+        foreign_type("a/msg/A", rule.join(["T0 t\n", *chain]))
     with pytest.raises(InputError, match="heads no part of a schema"):
         foreign_type("a/msg/A", f"B b\n{rule}B\nint32 a\n")
