@@ -135,7 +135,10 @@ class Commander:
         if not self.flight.landed:
             self._say(Severity.CRITICAL, "Takeoff denied: already in the air")
             return Result.DENIED
-        self._climb_m = climb_m
+        least = self._parameters["MIS_TAKEOFF_ALT"]
+        if climb_m < least - 0.1:
+            self._say(Severity.CRITICAL, f"Using minimum takeoff altitude: {least:.2f} m")
+        self._climb_m = max(climb_m, least) if math.isfinite(climb_m) else math.nan
         return self.set_mode(now_ns, Mode.TAKEOFF)
 
     def climb_to(self, climb_m: float) -> None:

@@ -84,10 +84,11 @@ class Commands:
         return self._commander.set_mode(c.now_ns, mode) if mode else Result.DENIED
 
     def _take_off(self, c: Command) -> Result:
+        """To an altitude above sea level; one that is too low is raised and said, as PX4 does."""
         altitude = c.params[6]
         down = float(self._commander.position[2])
         climb = altitude - self._telemetry.origin[2] + down if math.isfinite(altitude) else math.nan
-        return self._commander.take_off(c.now_ns, climb) if not climb <= 0 else Result.DENIED
+        return self._commander.take_off(c.now_ns, climb)
 
     def _turn(self, c: Command) -> Result:
         """CONDITION_YAW: heading in degrees, absolute, or relative with the direction of param 3."""

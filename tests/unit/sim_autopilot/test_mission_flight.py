@@ -170,3 +170,21 @@ def test_a_global_setpoint_flies_to_the_same_place_as_a_local_one(bench):
     assert b.autopilot.mode == "OFFBOARD"
     p = b.truth[-1][1:4]
     assert p == [pytest.approx(3.0, abs=0.3), pytest.approx(4.0, abs=0.3), pytest.approx(6.0, abs=0.3)]
+
+
+def test_a_take_off_to_an_altitude_below_is_raised_to_the_minimum(bench):
+    b = ready(bench, parameters={"MIS_TAKEOFF_ALT": 3.0})
+    assert b.command(400, 1) == ACCEPTED
+    assert b.command(22, 0, 0, 0, 0, 0, 0, 5.0) == ACCEPTED  # above sea level, where the ground is at 488 m
+    b.run(8.0)
+    assert "Using minimum takeoff altitude: 3.00 m" in b.texts()
+    assert b.truth[-1][3] == pytest.approx(3.0, abs=0.8)
+    assert b.autopilot.mode == "HOLD"
+
+
+def test_one_mode_is_listed_when_it_is_asked_for_by_its_number(bench):
+    b = ready(bench)
+    assert b.command(512, 435, 2) == ACCEPTED
+    (mode,) = b.of("AVAILABLE_MODES")
+    assert mode.mode_index == 2
+    assert b.command(512, 435, mode.number_modes + 1) == DENIED
