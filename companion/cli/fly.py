@@ -15,7 +15,9 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from companion.cli import simulation
 from companion.cli.flight_input import read_text, stack_config
+from companion.cli.live_outcome import print_live
 from companion.cli.outcome import Outcome, print_outcome, write_outcome
+from companion.cli.realtime import fly_realtime
 from companion.config import Config, dump_config
 from companion.core.node import Node
 from companion.mission.model import Mission, parse_mission
@@ -63,6 +65,7 @@ def fly(
     record: Annotated[
         bool, typer.Option(help="Store raw scans and images for `companion replay`: 3 MB per flown second.")
     ] = False,
+    realtime: Annotated[bool, typer.Option(help="In real time, as processes on the bus, instead of lockstep.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
@@ -86,6 +89,12 @@ def fly(
         record=record,
     )
     console = Console(quiet=quiet or as_json, stderr=as_json)
+    if realtime:
+        summary = fly_realtime(request, console)
+        print_live(summary, request.out, console, as_json=as_json)
+        if not summary.completed:
+            raise typer.Exit(1)
+        return
     outcome = fly_request(request, console)
     print_outcome(outcome, console, as_json=as_json)
     if not outcome.summary.completed:

@@ -8,16 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.simulation import Simulator
+from companion.cli.simulation import Simulator, scenery_of
 from companion.config import dump_config
 from companion.core.node import Node
 from companion.mapping.node import MappingNode
-from companion.report.flight_figure import draw_flight
+from companion.report.flight_figure import draw_flight, headline
 from companion.report.summary import Summary, to_json, trajectory_figures
 from companion.report.tracks import Tracks
 from companion.runtime.flight import Flight
@@ -56,7 +57,8 @@ def write_outcome(
     _write_why(out / "why.log", tracks)
     _write_map(out / "map.npz", stack)
     picture = out / "flight.png"
-    draw_flight(picture, tracks, sim.scenery(), summary)
+    title = headline(summary.mission, summary.world, summary.seed, summary.reason, msgspec.structs.asdict(summary))
+    draw_flight(picture, tracks, scenery_of(sim.world), title)
     return Outcome(summary, out, picture, tracks)
 
 

@@ -42,7 +42,6 @@ LOOK_S = 0.02
 class RunRequest:
     """What is to be flown, by which vehicle."""
 
-    mission_file: Path
     mission: Mission
     mission_text: str
     config: Config
@@ -77,7 +76,6 @@ def run(
     text = read_text(mission)
     parsed = parse_mission(text, file=str(mission))
     request = RunRequest(
-        mission_file=mission,
         mission=parsed,
         mission_text=text,
         config=stack_config(config, tuple(set_ or ())),
@@ -89,14 +87,14 @@ def run(
         log=log,
     )
     console = Console(quiet=quiet or as_json, stderr=as_json)
-    summary = fly_live(request, console)
+    summary, _ = fly_live(request, console)
     print_live(summary, request.out, console, as_json=as_json)
     if not summary.completed:
         raise typer.Exit(1)
 
 
-def fly_live(request: RunRequest, console: Console) -> LiveSummary:
-    """Fly it, write everything into `request.out`, return what came out."""
+def fly_live(request: RunRequest, console: Console) -> tuple[LiveSummary, Tracks]:
+    """Fly it, write everything into `request.out`, return what came out and what was seen."""
     request.out.mkdir(parents=True, exist_ok=True)
     clock = Clock.of_host()
     with ExitStack() as stack:
@@ -114,7 +112,7 @@ def fly_live(request: RunRequest, console: Console) -> LiveSummary:
             airborne=lambda: monitor.airborne,
         )
         lost = _fly(supervisor, monitor, tracks, clock, console)
-        return write_live(request, supervisor, monitor, tracks, lost)
+        return write_live(request, supervisor, monitor, tracks, lost), tracks
 
 
 def _fly(supervisor: Supervisor, monitor: Monitor, tracks: Tracks, clock: Clock, console: Console) -> str:

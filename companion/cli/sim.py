@@ -23,6 +23,7 @@ from companion.core.messages import GroundTruth, MavlinkBytes
 from companion.core.node import Topic
 from companion.runtime.bus.attach import BusOutlet
 from companion.runtime.bus.graph import Graph
+from companion.runtime.bus.scene import ClockOutlet
 from companion.runtime.bus.session import ENDPOINT, open_session
 from companion.runtime.clock import Clock
 from companion.runtime.live import Outlet
@@ -30,6 +31,7 @@ from companion.runtime.paced import Pace, Paced
 from companion.runtime.ports.endpoint import Endpoint, parse_endpoint
 from companion.runtime.ports.key_file import load_key
 from companion.runtime.ports.mavlink_link import Link, open_link
+from companion.runtime.priority import run_first
 from sim.node import SimNode
 from sim.rehearsal import rehearse
 from sim.sensors.render import RenderError, WorkerRenderer
@@ -123,7 +125,7 @@ def on_bus(endpoint: str, vehicle: str) -> Iterator[list[Outlet]]:
         yield []
         return
     with open_session("first", endpoint=endpoint) as session, Graph(session) as graph:
-        yield [BusOutlet(graph, {"SimNode": SimNode.publishes}, vehicle=vehicle)]
+        yield [BusOutlet(graph, {"SimNode": SimNode.publishes}, vehicle=vehicle), ClockOutlet(graph, vehicle=vehicle)]
 
 
 class Stopped:
@@ -161,6 +163,7 @@ def simulate(
     with opened as simulator, ExitStack() as stack:
         with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):
             _warm(simulator)
+        run_first()  # as the hardware that this stands for; the render worker is there already and stays behind
         node, watch, wire = simulator.new_node(signing_key=request.key), Watch(), Wire()
         pace = Pace(clock.now_ns(), speed=request.speed)
         paced = Paced([node], pace=pace, outlets=[wire, watch, *outlets])

@@ -30,20 +30,6 @@ class Simulator:
         """The vehicle at the start, as a node."""
         return SimNode(self.config, self.world, self.renderer, seed=self.seed, signing_key=signing_key)
 
-    def scenery(self) -> Scenery:
-        """The world as the picture shows it."""
-        nx, ny = self.world.heights.shape
-        stems = self.world.stems
-        return Scenery(
-            stem_xy=np.column_stack([stems.x, stems.y]),
-            stem_diameter_m=stems.dbh_m,
-            stem_base_z=stems.z_ground,
-            stem_height_m=stems.height_m,
-            contour_x=self.world.origin_xy[0] + self.world.cell_m * np.arange(nx),
-            contour_y=self.world.origin_xy[1] + self.world.cell_m * np.arange(ny),
-            ground_z=self.world.heights,
-        )
-
     def cpu_s(self, node_cpu_s: float) -> dict[str, float]:
         """CPU seconds per part of the simulator, each counted once wherever rendering ran."""
         rendered = self.renderer.cpu_s
@@ -53,6 +39,21 @@ class Simulator:
     def describe(self) -> str:
         """The simulator's configuration as YAML."""
         return dump_struct(self.config, root="sim")
+
+
+def scenery_of(world: World) -> Scenery:
+    """The world as the picture of a flight shows it."""
+    nx, ny = world.heights.shape
+    stems = world.stems
+    return Scenery(
+        stem_xy=np.column_stack([stems.x, stems.y]),
+        stem_diameter_m=stems.dbh_m,
+        stem_base_z=stems.z_ground,
+        stem_height_m=stems.height_m,
+        contour_x=world.origin_xy[0] + world.cell_m * np.arange(nx),
+        contour_y=world.origin_xy[1] + world.cell_m * np.arange(ny),
+        ground_z=world.heights,
+    )
 
 
 @contextmanager

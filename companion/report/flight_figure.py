@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 
 from companion.core.messages import Array
 from companion.report import style
-from companion.report.summary import Summary, aligned
+from companion.report.summary import aligned
 from companion.report.tracks import Track, Tracks
 
 
@@ -31,7 +32,7 @@ class Scenery:
     ground_z: Array  # (X, Y)
 
 
-def draw_flight(path: Path, tracks: Tracks, scenery: Scenery, summary: Summary) -> None:
+def draw_flight(path: Path, tracks: Tracks, scenery: Scenery, title: str) -> None:
     """Write `path` (PNG): trunks to scale, true path dark, estimate coloured by its error."""
     style.apply()
     estimate, truth = aligned(tracks)
@@ -41,17 +42,18 @@ def draw_flight(path: Path, tracks: Tracks, scenery: Scenery, summary: Summary) 
     _from_above(figure, above, tracks, scenery, estimate, truth)
     _from_side(side, tracks, scenery, estimate, truth)
     _error_over_time(error, tracks, estimate, truth)
-    figure.suptitle(_headline(summary), x=0.01, ha="left", fontsize=10)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     figure.savefig(path)
     plt.close(figure)
 
 
-def _headline(summary: Summary) -> str:
-    outcome = "completed" if summary.completed else f"not completed: {summary.reason}"
+def headline(mission: str, world: str, seed: int, failure: str, figures: Mapping[str, float]) -> str:
+    """What a flight came to, in a line or two; `figures` as of `trajectory_figures`."""
+    outcome = f"not completed: {failure}" if failure else "completed"
     return (
-        f"{summary.mission} in {summary.world}, seed {summary.seed}: {outcome}. "
-        f"{summary.path_length_m:.0f} m at {summary.mean_speed_m_s:.1f} m/s, hull clearance "
-        f"≥ {summary.min_clearance_m:.2f} m, estimate within {100 * summary.position_rmse_m:.1f} cm rms"
+        f"{mission} in {world}, seed {seed}: {outcome}. "
+        f"{figures['path_length_m']:.0f} m at {figures['mean_speed_m_s']:.1f} m/s, hull clearance "
+        f"≥ {figures['min_clearance_m']:.2f} m, estimate within {100 * figures['position_rmse_m']:.1f} cm rms"
     )
 
 

@@ -28,6 +28,7 @@ from companion.core.node import Node
 from companion.mission.model import parse_mission
 from companion.runtime.bus.attach import BusOutlet, Hearing
 from companion.runtime.bus.graph import Graph
+from companion.runtime.bus.scene import SceneOutlet
 from companion.runtime.bus.session import open_session
 from companion.runtime.clock import Clock
 from companion.runtime.inbox import InboxLog, inbox_path
@@ -39,6 +40,7 @@ from companion.runtime.log_file import Header
 from companion.runtime.monitor import Monitor
 from companion.runtime.no_log import NoLog
 from companion.runtime.pipes import Assignment, Beat, NodeBeat, Word
+from companion.runtime.priority import run_first
 from companion.runtime.vehicle_link import VehicleLink
 from companion.stack import GROUPS, build, warm
 
@@ -55,6 +57,8 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal: the supervisor decides
     words = lines_of(0)
     assignment = msgspec.json.decode(next(words), type=Assignment)
+    if assignment.link:
+        run_first()  # before any thread is there: they inherit it
     try:
         with ExitStack() as stack:
             return Process(assignment, words, up, stack).run()
@@ -101,7 +105,7 @@ class Process:
         config = load_config(a.config, file="config.yaml")
         if a.resumed:
             config = in_the_air(config)
-        self._config = dump_config(config)
+        self._config = config
         nodes = build(config, parse_mission(a.mission, file="mission.yaml"), seed=a.seed, only=GROUPS[a.group])
         warm(config, nodes)
         return nodes
@@ -111,7 +115,11 @@ class Process:
         session = stack.enter_context(open_session("peer", endpoint=a.bus))
         graph = stack.enter_context(Graph(session))
         bus = BusOutlet(graph, {name(node): node.publishes for node in self._nodes}, vehicle=a.vehicle)
-        outlets: list[Outlet] = [bus, self._latency]
+        published = list({t.name: t for node in self._nodes for t in node.publishes}.values())
+        scene = SceneOutlet(graph, published, name=f"{a.group}_scene", vehicle=a.vehicle)
+        if a.link:
+            scene.show_sensors(self._config.rig, self._clock.now_ns())
+        outlets: list[Outlet] = [bus, self._latency, scene]
         self._figures += [bus.figures, self._latency.figures]
         if a.link:
             self._link = stack.enter_context(VehicleLink(a.link, clock=self._clock))
@@ -134,7 +142,7 @@ class Process:
             nodes=tuple(name(node) for node in self._nodes),
             seed=a.seed,
             mission=a.mission,
-            config=self._config,
+            config=dump_config(self._config),
             epoch_ns=a.clock_offset_ns,
         )
         return stack.enter_context(closing(InboxLog(inbox_path(Path(a.out), a.group), header)))

@@ -43,6 +43,15 @@ class View:
     shared: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class ViewTopic:
+    """What a view will be called, for who must announce it before the first."""
+
+    topic: str
+    type: str
+    shared: bool = False
+
+
 def views_of(topic: Topic[Any], message: Any) -> Iterator[View]:
     """What a viewer is told because of one of our messages."""
     if make := _VIEWS.get(topic.name):
@@ -113,6 +122,17 @@ def _why(w: Why) -> Iterator[View]:
     yield View("rosout", "rcl_interfaces/msg/Log", value, shared=True)
 
 
+_FRAMES = ViewTopic("tf", "tf2_msgs/msg/TFMessage", shared=True)
+ANNOUNCED: dict[str, tuple[ViewTopic, ...]] = {
+    topics.ODOMETRY.name: (_FRAMES, ViewTopic("odom", "nav_msgs/msg/Odometry")),
+    topics.SMOOTHED.name: (_FRAMES,),
+    topics.REGISTERED.name: (ViewTopic("cloud", "sensor_msgs/msg/PointCloud2"),),
+    topics.LOCAL_MAP.name: (ViewTopic("map/occupied", "sensor_msgs/msg/PointCloud2"),),
+    topics.TRAJECTORY.name: (ViewTopic("path", "nav_msgs/msg/Path"),),
+    topics.PLAN.name: (ViewTopic("plan", "nav_msgs/msg/Path"),),
+    topics.GOAL.name: (ViewTopic("goal", "geometry_msgs/msg/PoseStamped"),),
+    topics.WHY.name: (ViewTopic("rosout", "rcl_interfaces/msg/Log", shared=True),),
+}
 _VIEWS: dict[str, Callable[[Any], Iterator[View]]] = {
     topics.ODOMETRY.name: _odometry,
     topics.SMOOTHED.name: _smoothed,
