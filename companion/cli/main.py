@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 import companion
-from companion.cli import config, doctor, export, fly, mavlink, mission, odometry, replay, run, sim
+from companion.cli import config, doctor, export, fly, mavlink, mission, odometry, replay, run, sim, topic
 from companion.core.errors import CompanionError
 
 app = typer.Typer(
@@ -36,6 +36,17 @@ def _group(name: str, help_text: str, **commands: object) -> None:
 _group("mission", "Check mission files.", check=mission.check, table=mission.table)
 _group("config", "Show the configuration.", dump=config.dump)
 _group("mavlink", "Look into MAVLink logs.", inspect=mavlink.inspect)
+
+_group(
+    "topic",
+    "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",
+    list=topic.list_topics,
+    info=topic.info,
+    echo=topic.echo,
+    hz=topic.hz,
+    bw=topic.bw,
+    delay=topic.delay,
+)
 
 
 @app.callback(invoke_without_command=True)

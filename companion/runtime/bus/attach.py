@@ -13,6 +13,7 @@ import zenoh
 
 from companion.core import topics
 from companion.core.node import Service, Topic
+from companion.runtime.bus.gaps import Gaps
 from companion.runtime.bus.graph import Arrival, Graph, Publisher, Urgency
 from companion.runtime.wire import codec_of
 from companion.runtime.wire.keys import qos_of
@@ -77,14 +78,18 @@ class Hearing:
     def __init__(
         self, graph: Graph, wanted: Sequence[Topic[Any]], receiver: Receiver, *, listener: str, vehicle: str
     ) -> None:
-        self.lost: Counter[str] = Counter()
         self.heard: Counter[str] = Counter()
+        self._gaps = {topic.name: Gaps() for topic in wanted}
         self._receiver = receiver
-        self._newest: dict[tuple[str, bytes], int] = {}
         entity = graph.node(listener, namespace=f"/{vehicle}")
         for topic in wanted:
             if topic not in LINK_ONLY:
                 self._subscribe(entity, topic, vehicle)
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Samples lost per topic, where there are any."""
+        return {topic: gaps.lost for topic, gaps in self._gaps.items() if gaps.lost}
 
     def figures(self) -> dict[str, float]:
         """Samples heard and lost."""
@@ -95,17 +100,8 @@ class Hearing:
         decode = codec_of(topic).decode
 
         def take(arrival: Arrival) -> None:
-            self._count(topic.name, arrival)
+            self.heard[topic.name] += 1
+            self._gaps[topic.name].note(arrival.attachment)
             self._receiver.receive(topic, arrival.payload, decode=decode)
 
         entity.subscribe(bus_name(topic, vehicle), codec_of(topic).type, qos_of(topic), take)
-
-    def _count(self, topic: str, arrival: Arrival) -> None:
-        self.heard[topic] += 1
-        if arrival.attachment is None:
-            return
-        key, number = (topic, arrival.attachment.gid), arrival.attachment.sequence
-        before = self._newest.get(key)
-        if before is not None and number > before + 1:
-            self.lost[topic] += number - before - 1
-        self._newest[key] = number

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import zenoh
 from zenoh import ext
@@ -30,9 +30,27 @@ from companion.runtime.wire.keys import (
     topic_key,
     unpack_attachment,
 )
-from companion.runtime.wire.types import ServiceType, WireType
 
 Received = Callable[["Arrival"], None]
+
+
+class Identity(Protocol):
+    """What names a type on the bus: a `WireType`, a `ServiceType`, or the names alone."""
+
+    @property
+    def name(self) -> str:
+        """`package/msg/Name`."""
+        ...
+
+    @property
+    def dds_name(self) -> str:
+        """As in keys: `package::msg::dds_::Name_`."""
+        ...
+
+    @property
+    def type_hash(self) -> str:
+        """`RIHS01_` and 64 hex digits."""
+        ...
 
 
 class Arrival(NamedTuple):
@@ -86,7 +104,7 @@ class GraphNode:
         self._id = graph.next_id()
         self._declare("NN", self._id)
 
-    def publisher(self, name: str, kind: WireType, qos: Qos, urgency: Urgency | None = None) -> Publisher:
+    def publisher(self, name: str, kind: Identity, qos: Qos, urgency: Urgency | None = None) -> Publisher:
         """A publisher on the full topic name; transient local ones keep `qos.depth` samples for late joiners."""
         gid = self._declare("MP", topic=name, kind=kind, qos=qos)
         how = urgency or Urgency()
@@ -105,7 +123,7 @@ class GraphNode:
         self._graph.keep(declared)
         return Publisher(declared, gid, keeps=qos.transient_local)
 
-    def subscribe(self, name: str, kind: WireType, qos: Qos, received: Received) -> None:
+    def subscribe(self, name: str, kind: Identity, qos: Qos, received: Received) -> None:
         """Call `received` for every sample, on Zenoh's thread: it must only put the sample away."""
         self._declare("MS", topic=name, kind=kind, qos=qos)
         session, key = self._graph.session, topic_key(name, kind, domain=self._graph.domain)
@@ -121,7 +139,7 @@ class GraphNode:
             declared = session.declare_subscriber(key, take)
         self._graph.keep(declared)
 
-    def serve(self, name: str, kind: ServiceType, answer: Callable[[bytes], bytes]) -> None:
+    def serve(self, name: str, kind: Identity, answer: Callable[[bytes], bytes]) -> None:
         """Answer requests (CDR in, CDR out) on Zenoh's thread; an answer must be quick and raise only WireError."""
         qos = Qos(depth=10)
         gid = self._declare("SS", topic=name, kind=kind, qos=qos)
@@ -140,7 +158,7 @@ class GraphNode:
         key = topic_key(name, kind, domain=self._graph.domain)
         self._graph.keep(self._graph.session.declare_queryable(key, reply, complete=True))
 
-    def call(self, name: str, kind: ServiceType, request: bytes, *, stamp_ns: int, timeout_s: float) -> bytes | None:
+    def call(self, name: str, kind: Identity, request: bytes, *, stamp_ns: int, timeout_s: float) -> bytes | None:
         """Ask a service; None if nobody answers in time. Raises WireError for an answer that is an error."""
         gid = self._declare("SC", topic=name, kind=kind, qos=Qos(depth=10))
         replies = self._graph.session.get(
@@ -163,7 +181,7 @@ class GraphNode:
         entity_id: int | None = None,
         *,
         topic: str = "",
-        kind: WireType | ServiceType | None = None,
+        kind: Identity | None = None,
         qos: Qos | None = None,
     ) -> bytes:
         """Declare the token of an entity; returns the gid that goes with it."""

@@ -78,6 +78,10 @@ class WireType:
         """Fields in order."""
         return tuple(f.name for f in self.fields)
 
+    def nested(self, name: str) -> WireType:
+        """A type that a field of this one names as its base."""
+        return self._types[name]
+
     def default(self) -> dict[str, Any]:
         """A full value of defaults."""
         return complete(self._types.library, self.name, {})

@@ -1,0 +1,59 @@
+"""What the tools on the bus share: options, Ctrl-C, lines that come one by one."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Event
+from types import FrameType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from companion.core.errors import CompanionError
+from companion.runtime.bus.session import ENDPOINT
+
+Bus = Annotated[str, typer.Option("--bus", help="Zenoh endpoint of the bus.")]
+Vehicle = Annotated[str, typer.Option("--name", help="Vehicle whose topics need no /NAME/ before them.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, one object per line.")]
+ForS = Annotated[float, typer.Option("--for-s", min=0, help="End after so many seconds [at Ctrl-C].")]
+Count = Annotated[int, typer.Option("-n", "--count", min=0, help="End after so many messages [at Ctrl-C].")]
+
+BUS, VEHICLE = ENDPOINT, "drone1"
+
+
+@contextmanager
+def stopping() -> Iterator[Event]:
+    """An event that Ctrl-C and SIGTERM set; a second one ends at once."""
+    stopped = Event()
+
+    def ask(_signal: int, _frame: FrameType | None) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
+        stopped.set()
+
+    before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def say(line: str) -> None:
+    """One line on standard output, at once: a pipe must not hold it back."""
+    print(line, flush=True)
+
+
+def warn(line: str) -> None:
+    """One line on standard error."""
+    Console(stderr=True, soft_wrap=True).print(line, highlight=False, markup=False)
+
+
+def nothing_heard(name: str, stopped: Event) -> CompanionError | None:
+    """What to say if no message came; nothing if the user did not want to wait."""
+    if stopped.is_set():
+        return None
+    return CompanionError(f"no message on {name} in the time: `companion topic info {name}` shows who publishes it")

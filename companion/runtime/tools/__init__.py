@@ -1,0 +1,1 @@
+"""What `companion topic`, `node`, `service` and `top` do: all of it works without a terminal, and without ROS."""
