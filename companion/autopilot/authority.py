@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import Final
 
 RELEASE_S: Final = 15.0  # longer than a mission goes on asking
-_MODE_OF: Final = {"offboard": "OFFBOARD", "hold": "HOLD", "land": "LAND", "return": "RETURN"}
-_FOLLOWS: Final = {"RETURN": ("LAND",)}  # where a mode leads by itself
+MODE_OF: Final[dict[str, str]] = {"offboard": "OFFBOARD", "hold": "HOLD", "land": "LAND", "return": "RETURN"}
+_FOLLOWS: Final[dict[str, tuple[str, ...]]] = {"RETURN": ("LAND",)}  # where a mode leads by itself
 
 
 class Authority:
@@ -34,13 +34,13 @@ class Authority:
 
     def asked(self, kind: str, mode: str) -> None:
         """We command a mode while the vehicle is in `mode`."""
-        if kind in _MODE_OF:
-            self._wanted, self._before = _MODE_OF[kind], mode
+        if kind in MODE_OF:
+            self._wanted, self._before = MODE_OF[kind], mode
             self._reached = mode == self._wanted
 
     def refused(self, kind: str) -> None:
         """The autopilot did not do it; what it does now is not ours unless it was before."""
-        if not self._armed and not self._reached and _MODE_OF.get(kind) == self._wanted:
+        if not self._armed and not self._reached and MODE_OF.get(kind) == self._wanted:
             self._wanted = ""
 
     def saw(self, mode: str, *, armed: bool, now_ns: int) -> bool:

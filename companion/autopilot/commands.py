@@ -73,6 +73,14 @@ class CommandDesk:
             return Verdict(waiting.kind, True, "")
         return Verdict(waiting.kind, False, _RESULTS.get(ack.result, f"result {ack.result}"))
 
+    def fulfil(self, kind: str) -> Verdict | None:
+        """What was asked is so: the answer may be lost, but nothing must be sent again."""
+        for command, waiting in list(self._waiting.items()):
+            if waiting.kind == kind:
+                del self._waiting[command]
+                return Verdict(kind, True, "")
+        return None
+
     def cancel(self, reason: str) -> list[Verdict]:
         """Forget every waiting command, so that none is sent again; how they ended."""
         ended = [Verdict(waiting.kind, False, reason) for waiting in self._waiting.values()]

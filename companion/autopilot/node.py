@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Final, Literal
-
-import msgspec
+from typing import Final
 
 from companion.autopilot import codec, modes, timesync
-from companion.autopilot.authority import Authority
+from companion.autopilot.authority import MODE_OF, Authority
 from companion.autopilot.commands import CommandDesk, Verdict
+from companion.autopilot.config import AutopilotConfig as AutopilotConfig  # for who builds the node
 from companion.autopilot.intervals import Intervals
 from companion.autopilot.neighbours import Neighbours
 from companion.autopilot.outgoing import Target, odometry_message, setpoint_message
 from companion.autopilot.signing import Signing
 from companion.autopilot.texts import News, Newsroom, Severity, pieces
-from companion.autopilot.timesync import TimesyncConfig, TimesyncFilter
+from companion.autopilot.timesync import TimesyncFilter
 from companion.autopilot.vehicle import Id, State, Vehicle
 from companion.autopilot.wire import Frame, Parser
 from companion.core.messages import (
@@ -43,10 +42,6 @@ from companion.core.topics import (
     WHY,
 )
 
-_Id = Annotated[int, msgspec.Meta(ge=1, le=255)]
-_Count = Annotated[int, msgspec.Meta(ge=1)]
-_Seconds = Annotated[float, msgspec.Meta(gt=0)]
-
 _TICK_HZ: Final = 10
 _COMMAND_ACK: Final = 77
 _TIMESYNC: Final = 111
@@ -54,38 +49,6 @@ _ONBOARD_CONTROLLER: Final = 18  # MAV_TYPE
 _ACTIVE: Final = 4  # MAV_STATE
 _REJECTED_EVERY_TICKS: Final = 100
 _WANTED: Final = (*Id, _COMMAND_ACK, _TIMESYNC)
-
-
-class AutopilotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Whom we talk to, and how."""
-
-    system: _Id = 1
-    """Our own MAVLink system: the vehicle's, since we fly on it."""
-    component: _Id = 191
-    """Our own component: MAV_COMP_ID_ONBOARD_COMPUTER."""
-    target_system: _Id = 1
-    """The autopilot's system; everyone else on the link is ignored."""
-    target_component: _Id = 1
-    """The autopilot's component."""
-    odometry_hz: Annotated[float, msgspec.Meta(gt=0, le=100)] = 30.0
-    """Rate of ODOMETRY to the autopilot; 30-50 suits PX4 and ArduPilot."""
-    odometry_clock: Literal["companion", "autopilot"] = "companion"
-    """Clock of its stamps. PX4 converts ours itself by TIMESYNC; `autopilot` converts here."""
-    rate_variance: Annotated[float, msgspec.Meta(ge=0)] = 1e-4
-    """Variance of the body rates in ODOMETRY, (rad/s)^2: a MEMS gyro's."""
-    heartbeat_timeout_s: _Seconds = 3.0
-    """Disconnected after so long without heartbeat."""
-    data_timeout_s: _Seconds = 1.0
-    """The autopilot's own position is stale after so long; slow messages after three times that."""
-    require_prearm: bool = True
-    """`ready` needs the prearm bit of SYS_STATUS. PX4 computes it for the current mode."""
-    ack_ticks: _Count = 5
-    """Ticks of 0.1 s to wait for a COMMAND_ACK before sending again."""
-    attempts: _Count = 4
-    """Transmissions of a command before it counts as rejected for timeout."""
-    interval_requests: Annotated[int, msgspec.Meta(ge=0)] = 5
-    """How often to ask for a message that does not come, per connection."""
-    timesync: TimesyncConfig = TimesyncConfig()
 
 
 class AutopilotNode(Node):
@@ -170,13 +133,19 @@ class AutopilotNode(Node):
         yield from self._tell(News(Severity.WARNING, "autopilot rebooted"), now_ns)
 
     def _watch_mode(self, now_ns: int) -> Outputs:
-        """Notice a takeover; what still waits for an answer must not be sent again."""
+        """What is done or taken from us must not be asked for again, though no answer came."""
         state = self._vehicle.state(now_ns)
+        for kind in self._fulfilled(state):
+            yield from self._results([self._desk.fulfil(kind)], now_ns)
         if self._authority.saw(state.mode, armed=state.armed, now_ns=now_ns):
             reason = self._authority.reason
             yield from self._results(self._desk.cancel(reason), now_ns)
             yield self._why(now_ns, "command no more", reason)
             yield from self._tell(News(Severity.WARNING, f"{state.mode} is not ours, setpoints stop"), now_ns)
+
+    @staticmethod
+    def _fulfilled(state: State) -> list[str]:
+        return ["arm" if state.armed else "disarm", *(kind for kind, mode in MODE_OF.items() if mode == state.mode)]
 
     def _on_double(self, frame: Frame, now_ns: int) -> Outputs:
         if self._neighbours.heard(frame.sequence, now_ns):
@@ -251,6 +220,9 @@ class AutopilotNode(Node):
         refusal = self._refusal(kind, now_ns)
         if refusal:
             yield from self._results([Verdict(kind, False, refusal)], now_ns)
+            return
+        if kind == "offboard" and self._vehicle.state(now_ns).mode == MODE_OF[kind] and self._authority.flying:
+            yield from self._results([Verdict(kind, True, "")], now_ns)  # asking again could undo what a pilot just did
             return
         system, component = self._target
         request = modes.order(kind, self._vehicle.flavour, system=system, component=component)

@@ -108,6 +108,18 @@ def test_restarted_in_flight_it_leaves_the_vehicle_to_its_failsafe():
     assert setpoints(flight.hear(3 * S, landed(1)), 3 * S) == 1
 
 
+def test_what_is_done_is_not_asked_for_again_when_the_answer_got_lost():
+    flight = ready_flight().feed(VEHICLE_COMMAND, command("offboard", S)).feed(VEHICLE_COMMAND, command("arm", S))
+    flight.hear(S + 100 * MS, heartbeat(OFFBOARD)).hear(S + 500 * MS, heartbeat(OFFBOARD, armed=True))
+    assert [(r.kind, r.accepted) for r in flight.published(COMMAND_RESULT)] == [("offboard", True), ("arm", True)]
+    flight.sent()
+    for i in range(30):
+        flight.tick(S + 500 * MS + i * 100 * MS)
+    flight.feed(VEHICLE_COMMAND, command("offboard", 2 * S))
+    assert [m for m in flight.sent(codec.CommandLong) if m.command in (SET_MODE, 400)] == []
+    assert flight.published(COMMAND_RESULT)[-1].accepted
+
+
 def test_it_is_over_when_the_vehicle_disarms():
     flight = flying().hear(2 * S, heartbeat(POSITION, armed=True)).hear(3 * S, heartbeat(POSITION))
     assert setpoints(flight, 3 * S) == 1
