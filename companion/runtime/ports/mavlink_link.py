@@ -103,11 +103,12 @@ class Link:
                 self._wake()
 
     def close(self) -> None:
-        """Stop the reader and close; may be called twice, not from `received`."""
+        """Stop the reader and close; may be called twice, and from `received`."""
         self._closing = True
         with self._lock:
             self._wake()
-        self._thread.join(JOIN_S)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_S)
         with self._lock:
             self._opened = False
             self._port.close()

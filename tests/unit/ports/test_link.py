@@ -322,6 +322,21 @@ def test_closing_ends_the_thread_and_sending_then_is_harmless(ear):
     assert threading.active_count() == threads and link.stats.dropped == 1
 
 
+def test_closing_from_the_callback(peer):
+    port, talker, links, done = free_port(), peer(), [], threading.Event()
+
+    def take(data, stamp_ns):
+        links[0].close()
+        done.set()
+
+    threads = threading.active_count()
+    links.append(open_link(f"udpin://127.0.0.1:{port}", take, clock=time.monotonic_ns))
+    talker.sendto(BEAT, ("127.0.0.1", port))
+    assert done.wait(5)
+    until(lambda: threading.active_count() == threads)
+    open_link(f"udpin://127.0.0.1:{port}", take, clock=time.monotonic_ns).close()  # the port is free again
+
+
 def test_sending_from_a_report_does_not_lock_up(ear, peer):
     port, talker, links = free_port(), peer(), []
     with open_link(
