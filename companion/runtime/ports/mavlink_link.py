@@ -83,6 +83,8 @@ class Link:
         self._openings, self._trouble = 0, ""
         self._lock = threading.RLock()  # held for calls that never wait; `report` may call `send`
         self._closing = False
+        self._polled: tuple[tuple[int, ...], tuple[int, ...]] = (), ()
+        self._poll = select.poll()
         self._port = _port(endpoint, self._traffic, clock=clock, report=report)
         self._opened = False
         if endpoint.kind != "tcp":  # the only opening that may take long
@@ -171,20 +173,29 @@ class Link:
 
     def _serve(self) -> list[bytes]:
         """Wait for the port or for a call; write what waits, read what is there."""
+        wake = self._wake_read.fileno()
         with self._lock:
-            readable, writable = self._port.descriptors(), self._port.writes()
-        poll = select.poll()
-        for descriptor in (*readable, self._wake_read.fileno()):
-            poll.register(descriptor, select.POLLIN)
-        for descriptor in writable:
-            poll.register(descriptor, select.POLLIN | select.POLLOUT)
-        ready = dict(poll.poll())
-        if ready.pop(self._wake_read.fileno(), 0):
-            self._wake_read.recv(4096)
+            poll = self._poll_of((wake, *self._port.descriptors()), tuple(self._port.writes()))
+        events = 0
+        for descriptor, event in poll.poll():
+            if descriptor == wake:
+                self._wake_read.recv(4096)
+            else:
+                events |= event
         with self._lock:
-            if any(event & select.POLLOUT for event in ready.values()):
+            if events & select.POLLOUT:
                 self._port.flush()
-            return self._port.read() if any(event & ~select.POLLOUT for event in ready.values()) else []
+            return self._port.read() if events & ~select.POLLOUT else []
+
+    def _poll_of(self, reads: tuple[int, ...], writes: tuple[int, ...]) -> select.poll:
+        """Made anew only when something changed: this runs once per datagram."""
+        if (reads, writes) != self._polled:
+            self._polled, self._poll = (reads, writes), select.poll()
+            for descriptor in reads:
+                self._poll.register(descriptor, select.POLLIN)
+            for descriptor in writes:
+                self._poll.register(descriptor, select.POLLIN | select.POLLOUT)
+        return self._poll
 
     def _deliver(self, pieces: list[bytes]) -> None:
         stamp_ns = self._clock()

@@ -45,7 +45,7 @@ class Port(Protocol):
         ...
 
     def read(self) -> list[bytes]:
-        """All that is there now; never waits."""
+        """What is there now, or a part of it; never waits."""
         ...
 
     def write(self, data: bytes) -> None:

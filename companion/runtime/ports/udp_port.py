@@ -17,7 +17,6 @@ from companion.runtime.ports.port import READ_BYTES, Clock, Report, Traffic, bou
 
 SILENCE_S: Final = 5.0
 BUFFER_BYTES: Final = 1 << 20
-BURST: Final = 64  # datagrams read before looking at anything else
 STRANGERS_MAX: Final = 16  # told of one by one
 MAGICS: Final = (0xFD, 0xFE)
 
@@ -63,19 +62,13 @@ class UdpPort:
         return []
 
     def read(self) -> list[bytes]:
-        """Datagrams of the peer."""
+        """One datagram of the peer: asking whether there is a second costs more than waiting for it."""
         assert self._socket is not None
-        found: list[bytes] = []
-        for _ in range(BURST):
-            try:
-                data, address = self._socket.recvfrom(READ_BYTES)
-            except BlockingIOError:
-                break
-            except ConnectionError:  # an earlier datagram of ours met a closed port
-                continue
-            if data and self._accepts(data, address):
-                found.append(data)
-        return found
+        try:
+            data, address = self._socket.recvfrom(READ_BYTES)
+        except (BlockingIOError, ConnectionError):  # the latter: an earlier one of ours met a closed port
+            return []
+        return [data] if data and self._accepts(data, address) else []
 
     def _accepts(self, data: bytes, address: tuple[str, int]) -> bool:
         now_ns = self._clock()
