@@ -8,7 +8,23 @@ import typer
 from rich.console import Console
 
 import companion
-from companion.cli import config, doctor, export, fly, mavlink, mission, odometry, replay, run, sim, topic
+from companion.cli import (
+    config,
+    doctor,
+    export,
+    fly,
+    mavlink,
+    mission,
+    node,
+    odometry,
+    record,
+    replay,
+    run,
+    service,
+    sim,
+    topic,
+    topic_pub,
+)
 from companion.core.errors import CompanionError
 
 app = typer.Typer(
@@ -20,6 +36,7 @@ app = typer.Typer(
 app.command("fly")(fly.fly)
 app.command("run")(run.run)
 app.command("sim")(sim.sim)
+app.command("record")(record.record)
 app.command("replay")(replay.replay)
 app.command("export")(export.export)
 app.command("doctor")(doctor.doctor)
@@ -46,7 +63,10 @@ _group(
     hz=topic.hz,
     bw=topic.bw,
     delay=topic.delay,
+    pub=topic_pub.pub,
 )
+_group("node", "Look at the nodes on the bus.", list=node.list_nodes, info=node.info)
+_group("service", "List and call services on the bus.", list=service.list_services, call=service.call_service)
 
 
 @app.callback(invoke_without_command=True)

@@ -17,11 +17,14 @@ from companion.core.node import Topic
 from companion.core.rig import Rig
 from companion.runtime.flight_folder import kinds_of, logs_of, read_header, rebuild
 from companion.runtime.log_file import Header, Message
-from companion.runtime.mcap_file import McapFile, Sample
+from companion.runtime.mcap_file import McapFile, Sample, offered
 from companion.runtime.replay import Replay
 from companion.runtime.viewer import View, sensor_frames, views_of
-from companion.runtime.wire import codec_of, wire_type
+from companion.runtime.wire import WireType, codec_of, wire_type
+from companion.runtime.wire.qos import Qos, qos_of
 
+SHOWN = Qos(depth=10)
+STATIC = Qos(transient_local=True, depth=1)  # so that `ros2 bag play` tells late joiners, too
 Heard = tuple[int, str, Any]  # time, topic, message
 
 
@@ -66,25 +69,27 @@ class _Writer:
             self._view(time_ns, time_ns, sensor_frames(self._rig))
         if topic.name not in self._skipped:
             codec = codec_of(topic)
-            self._put(
-                f"{self._vehicle}/{topic.name}", codec.type.name, codec.encode(message), time_ns, message.stamp_ns
-            )
+            name, times = f"{self._vehicle}/{topic.name}", (time_ns, message.stamp_ns)
+            self._put(name, codec.type, codec.encode(message), times, qos_of(topic))
         for view in views_of(topic, message):
             self._view(time_ns, message.stamp_ns, view)
 
     def _view(self, time_ns: int, stamp_ns: int, view: View) -> None:
         name = view.topic if view.shared else f"{self._vehicle}/{view.topic}"
-        self._put(name, view.type, wire_type(view.type).encode(view.value), time_ns, stamp_ns)
+        kind, qos = wire_type(view.type), STATIC if view.topic == "tf_static" else SHOWN
+        self._put(name, kind, kind.encode(view.value), (time_ns, stamp_ns), qos)
 
-    def _put(self, topic: str, kind: str, payload: bytes, log_ns: int, publish_ns: int) -> None:
+    def _put(self, topic: str, kind: WireType, payload: bytes, times: tuple[int, int], qos: Qos) -> None:
+        log_ns, publish_ns = times
         self._file.write(
             Sample(
                 topic=topic,
-                type=kind,
-                schema=wire_type(kind).schema,
+                type=kind.name,
+                schema=kind.schema,
                 payload=payload,
                 log_ns=log_ns,
                 publish_ns=publish_ns,
+                qos=offered(qos),
             )
         )
 

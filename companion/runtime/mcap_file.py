@@ -8,9 +8,11 @@ The format: mcap.dev/spec, profile `ros2`.
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 
@@ -21,8 +23,10 @@ from mcap.writer import CompressionType, Writer
 
 import companion
 from companion.core.errors import InputError
+from companion.runtime.wire.qos import Qos
 
 CHUNK_BYTES = 1 << 20
+_FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,6 +127,23 @@ def recover(path: Path, out: Path) -> int:
         for sample in samples(path):
             file.write(sample)
         return file.messages
+
+
+@cache
+def offered(qos: Qos) -> str:
+    """`offered_qos_profiles` of a channel as rosbag2 reads it: YAML, of which JSON is a part."""
+    profile = {
+        "history": 2 if qos.keep_all else 1,
+        "depth": qos.depth,
+        "reliability": 1 if qos.reliable else 2,
+        "durability": 1 if qos.transient_local else 2,
+        "deadline": _FOREVER,
+        "lifespan": _FOREVER,
+        "liveliness": 1,
+        "liveliness_lease_duration": _FOREVER,
+        "avoid_ros_namespace_conventions": False,
+    }
+    return json.dumps([profile])
 
 
 def _sample(message: Message, channel: Channel, schemas: dict[int, Schema]) -> Sample:

@@ -23,14 +23,14 @@ steps:
   - {do: takeoff, alt: 1.5}
   - {do: land}
 """
-SECONDS = 4
+SECONDS = 3
 
 
 def fly(folder, *options):
     (folder / "in.yaml").write_text(MISSION)
     command = ["fly", str(folder / "in.yaml"), "--world", "poisson", "--seed", "5", "--cores", "1", "--quiet"]
     result = CliRunner().invoke(app, [*command, "--limit-s", str(SECONDS), "--out", str(folder / "out"), *options])
-    assert result.exit_code == 1, result.output  # a flight of four seconds does not end its mission
+    assert result.exit_code == 1, result.output  # a flight of three seconds does not end its mission
     return folder / "out"
 
 
