@@ -298,7 +298,7 @@ class AutopilotNode(Node):
             return
         r = self._signing.rejected
         self._rejected_told = r.total
-        counts = f"{r.unsigned} unsigned, {r.forged} of another key or altered, {r.replayed} replayed so far"
+        counts = f"{r.unsigned} unsigned, {r.forged} of another key or altered, {r.replayed} replayed or too old so far"
         yield self._why(now_ns, "ignore frames without our signature", counts)
 
     def _why(self, now_ns: int, what: str, because: str) -> Output:
