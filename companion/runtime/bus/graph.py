@@ -31,6 +31,7 @@ from companion.runtime.wire.keys import (
     unpack_attachment,
 )
 
+_OF_ZENOH_ITSELF = zenoh.Encoding.ZENOH_STRING  # of an error that no server wrote
 Received = Callable[["Arrival"], None]
 
 
@@ -171,7 +172,7 @@ class GraphNode:
         for reply in replies:
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
-            if reply.err is not None:
+            if reply.err is not None and reply.err.encoding != _OF_ZENOH_ITSELF:  # "Timeout"
                 raise WireError(f"{name}: {reply.err.payload.to_bytes().decode(errors='replace')}")
         return None
 
@@ -214,7 +215,12 @@ class Publisher:
     @property
     def wanted(self) -> bool:
         """Whether anyone listens, or may join later and want what was said."""
-        return self._keeps or bool(self._declared.matching_status.matching)
+        return self._keeps or self.matched
+
+    @property
+    def matched(self) -> bool:
+        """Whether anyone listens: what is put before that is lost."""
+        return bool(self._declared.matching_status.matching)
 
     def put(self, payload: bytes, stamp_ns: int) -> None:
         """Send; drops rather than waits."""
