@@ -31,7 +31,7 @@ from companion.runtime.wire.keys import (
     unpack_attachment,
 )
 
-_OF_ZENOH_ITSELF = zenoh.Encoding.ZENOH_STRING  # of an error that no server wrote
+_TIMEOUT = b"Timeout"  # the error that the session or a router writes in the place of a server
 Received = Callable[["Arrival"], None]
 
 
@@ -172,8 +172,8 @@ class GraphNode:
         for reply in replies:
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
-            if reply.err is not None and reply.err.encoding != _OF_ZENOH_ITSELF:  # "Timeout"
-                raise WireError(f"{name}: {reply.err.payload.to_bytes().decode(errors='replace')}")
+            if reply.err is not None and (said := reply.err.payload.to_bytes()) != _TIMEOUT:
+                raise WireError(f"{name}: {said.decode(errors='replace')}")
         return None
 
     def _declare(
