@@ -37,6 +37,7 @@ def build(
     *,
     seed: int,
     only: Sequence[type[Node]] = NODES,
+    signing_key: bytes | None = None,
 ) -> list[Node]:
     """The nodes of the stack (or some of them), ready to be run by `companion.runtime`."""
     makers: dict[type[Node], Callable[[], Node]] = {
@@ -49,7 +50,7 @@ def build(
         TrackingNode: lambda: TrackingNode(config.tracking),
         MissionNode: lambda: MissionNode(mission, config.mission),
         SafetyNode: lambda: SafetyNode(config.safety, fence=mission.fence),
-        AutopilotNode: lambda: AutopilotNode(config.autopilot),
+        AutopilotNode: lambda: AutopilotNode(config.autopilot, signing_key=signing_key),
     }
     return [makers[kind]() for kind in only]
 

@@ -32,6 +32,7 @@ from companion.runtime.clock import Clock
 from companion.runtime.monitor import WATCHED, Monitor
 from companion.runtime.pipes import Assignment
 from companion.runtime.ports.endpoint import parse_endpoint
+from companion.runtime.ports.key_file import load_key
 from companion.runtime.supervisor import Supervisor
 from companion.stack import GROUPS
 
@@ -51,6 +52,7 @@ class RunRequest:
     seed: int
     out: Path
     log: bool
+    key_file: str = ""
 
 
 def run(
@@ -64,6 +66,7 @@ def run(
     name: Annotated[str, typer.Option(help="Name of the vehicle on the bus.")] = "drone1",
     bus: Annotated[str, typer.Option(help="Zenoh endpoint of the bus.")] = ENDPOINT,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the planner.")] = 0,
+    key: Annotated[Path | None, typer.Option(help="Key file that signs MAVLink; see `companion keys`.")] = None,
     log: Annotated[bool, typer.Option(help="Write what `companion replay` needs.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
@@ -85,7 +88,10 @@ def run(
         seed=seed,
         out=out or Path("flights") / f"{datetime.now():%Y-%m-%d-%H%M%S}-{parsed.name}",
         log=log,
+        key_file=str(key.resolve()) if key else "",
     )
+    if key:
+        load_key(key)  # a bad one is told now, not by a child
     console = Console(quiet=quiet or as_json, stderr=as_json)
     summary, _ = fly_live(request, console)
     print_live(summary, request.out, console, as_json=as_json)
@@ -205,6 +211,7 @@ def _assignments(request: RunRequest, clock: Clock) -> list[Assignment]:
             clock_offset_ns=clock.offset_ns,
             out=str(request.out),
             link=request.link if group == "control" else "",
+            key_file=request.key_file if group == "control" else "",
             log=request.log,
         )
         for group in GROUPS

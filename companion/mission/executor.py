@@ -105,7 +105,9 @@ class Executor:
             return
         kind: Kind = "arm" if vehicle.mode == "OFFBOARD" else "offboard"
         yield from self._ask(kind, now_ns)
-        if self._requests.exhausted(now_ns):
+        if "took over" in self._requests.refusal:
+            yield from self._finish(now_ns, self._requests.refusal)
+        elif self._requests.exhausted(now_ns):
             why = self._requests.refusal or vehicle.text or "no answer"
             yield from self._finish(now_ns, f"the autopilot refuses to {kind}: {why}")
 

@@ -25,10 +25,12 @@ def missing(inputs: Inputs, now_ns: int, *, fresh_s: float) -> str:
         return "no vehicle"
     if odometry is None or now_ns - odometry.stamp_ns > fresh_s * 1e9:
         return "no odometry"
-    if not vehicle.ready and not vehicle.armed:
-        return f"the autopilot is not ready: {vehicle.text}"
     if not vehicle.landed:
         return "the vehicle is in the air already"
+    if vehicle.armed:
+        return f"armed by somebody else, in mode {vehicle.mode}"
+    if not vehicle.ready:
+        return f"the autopilot is not ready: {vehicle.text}"
     if safety is not None and safety.action in ("hold", "land"):
         return safety.reason
     return ""

@@ -40,6 +40,7 @@ from companion.runtime.log_file import Header
 from companion.runtime.monitor import Monitor
 from companion.runtime.no_log import NoLog
 from companion.runtime.pipes import Assignment, Beat, NodeBeat, Word
+from companion.runtime.ports.key_file import load_key
 from companion.runtime.priority import run_first
 from companion.runtime.vehicle_link import VehicleLink
 from companion.stack import GROUPS, build, warm
@@ -106,7 +107,9 @@ class Process:
         if a.resumed:
             config = in_the_air(config)
         self._config = config
-        nodes = build(config, parse_mission(a.mission, file="mission.yaml"), seed=a.seed, only=GROUPS[a.group])
+        key = load_key(Path(a.key_file)) if a.key_file else None
+        mission = parse_mission(a.mission, file="mission.yaml")
+        nodes = build(config, mission, seed=a.seed, only=GROUPS[a.group], signing_key=key)
         warm(config, nodes)
         return nodes
 
@@ -126,7 +129,7 @@ class Process:
             outlets.append(self._link)
             self._figures.append(self._link.figures)
         log = HearingLog(self._log(stack), self._latency)
-        self._group = LiveGroup(self._nodes, clock=self._clock, log=log, outlets=outlets)
+        self._group = LiveGroup(self._nodes, clock=self._clock, log=log, outlets=outlets, shared=bool(a.link))
         hearing = Hearing(graph, self._group.wanted, self._group, listener=f"{a.group}_inbox", vehicle=a.vehicle)
         self._figures.append(hearing.figures)
         Hearing(graph, [topics.VEHICLE], self._watch, listener=f"{a.group}_watch", vehicle=a.vehicle)

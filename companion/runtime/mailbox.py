@@ -39,22 +39,44 @@ class Parcel:
         return self._message, self._number
 
 
+class Bell:
+    """Wakes the thread that empties some mailboxes; rung by any other."""
+
+    def __init__(self) -> None:
+        self.lock = Condition()
+        self._rung = False
+        self._waiting = False
+
+    def ring(self) -> None:
+        """Let a waiting `wait` return; call it with the lock held."""
+        self._rung = True
+        if self._waiting:
+            self.lock.notify()
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when rung since the last call, or after the time."""
+        with self.lock:
+            if not self._rung and timeout_s > 0:
+                self._waiting = True
+                self.lock.wait(timeout_s)
+                self._waiting = False
+            self._rung = False
+
+
 class Mailbox:
     """A queue in which a newer message of a `keep="latest"` topic replaces the one that waits."""
 
-    def __init__(self, *, limit: int = LIMIT) -> None:
+    def __init__(self, bell: Bell, *, limit: int = LIMIT) -> None:
         self.dropped = 0  # replaced, or pushed out of a full box
-        self._limit = limit
+        self._bell, self._limit = bell, limit
         self._waiting: deque[Parcel] = deque()
-        self._changed = Condition()
-        self._woken = False
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def put(self, parcel: Parcel) -> None:
         """Add a message; never waits for the node."""
-        with self._changed:
+        with self._bell.lock:
             if parcel.topic.keep == "latest":
                 kept = [p for p in self._waiting if p.topic is not parcel.topic]
                 if len(kept) < len(self._waiting):
@@ -64,18 +86,9 @@ class Mailbox:
                 self._waiting.popleft()
                 self.dropped += 1
             self._waiting.append(parcel)
-            self._changed.notify()
+            self._bell.ring()
 
-    def take(self, timeout_s: float) -> Parcel | None:
-        """The oldest message; None after `timeout_s` or `wake`."""
-        with self._changed:
-            if not self._waiting and not self._woken and timeout_s > 0:
-                self._changed.wait(timeout_s)
-            self._woken = False
+    def take(self) -> Parcel | None:
+        """The oldest message, or None."""
+        with self._bell.lock:
             return self._waiting.popleft() if self._waiting else None
-
-    def wake(self) -> None:
-        """Let a waiting `take` return."""
-        with self._changed:
-            self._woken = True
-            self._changed.notify()

@@ -10,7 +10,7 @@ from companion.core.messages import BaroReading, RangeReading
 from companion.core.node import Node, Outputs, Topic, every, on
 from companion.runtime.clock import Clock
 from companion.runtime.live import LiveGroup
-from companion.runtime.mailbox import Mailbox, Parcel
+from companion.runtime.mailbox import Bell, Mailbox, Parcel
 
 FAST = Topic("fast", RangeReading, 100.0, "all")
 SLOW = Topic("slow", BaroReading, 10.0, "latest")
@@ -95,35 +95,38 @@ def eventually(condition):
     raise AssertionError("never came true")
 
 
-def group_of(*nodes):
+def group_of(*nodes, shared=False):
     log, wire = Log(), Wire()
-    return LiveGroup(nodes, clock=Clock.of_host(), log=log, outlets=[wire]), log, wire
+    return LiveGroup(nodes, clock=Clock.of_host(), log=log, outlets=[wire], shared=shared), log, wire
 
 
 def test_a_newer_message_replaces_the_waiting_one_and_all_means_all():
-    box = Mailbox(limit=3)
+    box = Mailbox(Bell(), limit=3)
     for k in range(5):
         box.put(Parcel(FAST, reading(k)))
         box.put(Parcel(SLOW, BaroReading(stamp_ns=k, altitude_m=0.0)))
-    taken = [(p.topic.name, p.open(lambda *_: 0)[0].stamp_ns) for p in iter(lambda: box.take(0.0), None)]
+    taken = [(p.topic.name, p.open(lambda *_: 0)[0].stamp_ns) for p in iter(box.take, None)]
     assert [t for t in taken if t[0] == "slow"] == [("slow", 4)]
     assert [s for n, s in taken if n == "fast"] == [2, 3, 4][-len(taken) + 1 :]
     assert box.dropped == 10 - len(taken)
 
 
-def test_a_waiting_taker_is_woken_by_hand_and_by_mail():
-    box = Mailbox()
-    got = []
-    taker = threading.Thread(target=lambda: got.append(box.take(10.0)))
-    taker.start()
-    box.wake()
-    taker.join(5.0)
-    assert got == [None] and not taker.is_alive()
+def test_a_bell_that_was_rung_before_is_heard_and_a_waiting_thread_is_woken():
+    bell = Bell()
+    with bell.lock:
+        bell.ring()
+    bell.wait(60.0)
+    waiter = threading.Thread(target=bell.wait, args=(60.0,))
+    waiter.start()
+    Mailbox(bell).put(Parcel(FAST, reading(0)))
+    waiter.join(5.0)
+    assert not waiter.is_alive()
 
 
-def test_messages_flow_through_the_group_in_order_and_out_of_it():
+@pytest.mark.parametrize("shared", [False, True])
+def test_messages_flow_through_the_group_in_order_and_out_of_it(shared):
     relay, ear = Relay(), Ear()
-    group, log, wire = group_of(relay, ear)
+    group, log, wire = group_of(relay, ear, shared=shared)
     assert [t.name for t in group.wanted] == ["fast", "slow"]
     group.start()
     for k in range(50):
@@ -164,6 +167,18 @@ def test_ticks_never_go_back_and_skip_what_was_missed():
     (seat,) = group.seats
     span = round((ear.ticks[-1] - ear.ticks[0]) / 5e6)
     assert abs(len(ear.ticks) + seat.statistics.late_ticks - 1 - span) <= 2
+
+
+def test_on_a_shared_thread_timers_come_between_messages():
+    relay, ear = Relay(), Ear()
+    group, _, _ = group_of(relay, ear, shared=True)
+    group.start()
+    for k in range(3000):
+        group.receive(FAST, reading(k))
+    eventually(lambda: ear.stamps and ear.stamps[-1] == 2999)
+    assert group.stop() == []
+    gaps = [b - a for a, b in zip(ear.ticks, ear.ticks[1:], strict=False)]
+    assert len(ear.ticks) > 5 and sorted(gaps)[len(gaps) // 2] < 20e6  # the flood did not come first
 
 
 def test_a_payload_is_decoded_once_for_all_and_a_bad_one_stops_nobody():
