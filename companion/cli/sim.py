@@ -6,7 +6,7 @@ import gc
 import math
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -50,6 +50,7 @@ class SimRequest(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     for_s: float
     key: bytes | None = None  # MAVLink signing
+    bus: str = ""  # endpoint; '' for none
 
 
 class SimSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,13 +106,13 @@ def sim(
         overrides=("sim.open_sky=true", *overrides) if gps else overrides,
         name=name,
         for_s=for_s,
+        bus=bus,
         key=load_key(key) if key else None,
     )
     console = Console(quiet=quiet, stderr=as_json, soft_wrap=True, highlight=False)
     with _stopping() as stopped:
         try:
-            with on_bus(bus, name) as outlets:
-                summary = simulate(request, console, clock=Clock.of_host(), stopped=stopped, outlets=outlets)
+            summary = simulate(request, console, clock=Clock.of_host(), stopped=stopped)
         except KeyboardInterrupt:
             console.print("stopped before it was ready")
             return
@@ -153,10 +154,8 @@ def _stopping() -> Iterator[Stopped]:
             signal.signal(number, handler)
 
 
-def simulate(
-    request: SimRequest, console: Console, *, clock: Clock, stopped: Stopped, outlets: Sequence[Outlet] = ()
-) -> SimSummary:
-    """Run until somebody asked for the end; what the vehicle publishes goes to `outlets`, too."""
+def simulate(request: SimRequest, console: Console, *, clock: Clock, stopped: Stopped) -> SimSummary:
+    """Run until somebody asked for the end."""
     opened = simulation.open_simulator(
         request.world, request.seed, request.overrides, 1, console, most_waiting=MOST_WAITING
     )
@@ -164,6 +163,7 @@ def simulate(
         with console.status("compiling kernels (first start: up to a minute of CPU; cached afterwards)"):
             _warm(simulator)
         run_first()  # as the hardware that this stands for; the render worker is there already and stays behind
+        outlets = stack.enter_context(on_bus(request.bus, request.name))
         node, watch, wire = simulator.new_node(signing_key=request.key), Watch(), Wire()
         pace = Pace(clock.now_ns(), speed=request.speed)
         paced = Paced([node], pace=pace, outlets=[wire, watch, *outlets])
