@@ -19,8 +19,19 @@ from companion.core.errors import InputError
 from companion.runtime.flight_folder import logs_of, read_header, rebuild
 from companion.runtime.log_file import Header
 from companion.runtime.message_diff import TopicDifferences
+from companion.runtime.ports.key_file import load_key
 from companion.runtime.replay import RECORD_HINT, Replay
 from companion.runtime.replay_report import Difference, NodeReport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _How:
+    """What was asked for."""
+
+    node: str
+    overrides: tuple[str, ...]
+    chain: bool
+    key: bytes | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +54,7 @@ def replay(
     chain: Annotated[
         bool, typer.Option(help="With --set: nodes are fed what the changed nodes before them say.")
     ] = False,
+    key: Annotated[Path | None, typer.Option(help="Key file with which the link was signed in flight.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Replay FLIGHT. Example: companion replay flights/demo --node MappingNode
@@ -59,7 +71,8 @@ def replay(
     logs = [(log, header) for log, header in logs if not node or node in header.nodes]
     if not logs:
         raise InputError(f"{node!r} is no node of this flight", field="--node", valid=_nodes_of(flight))
-    results = [_replay(log, header, node, overrides, chain, console) for log, header in logs]
+    how = _How(node=node, overrides=overrides, chain=chain, key=load_key(key) if key else None)
+    results = [_replay(log, header, how, console) for log, header in logs]
     if as_json:
         typer.echo(json.dumps(_to_json(results, changed=bool(overrides)), indent=2))
     for done in results:
@@ -72,12 +85,13 @@ def _nodes_of(flight: Path) -> str:
     return ", ".join(n for log in logs_of(flight) for n in read_header(log).nodes)
 
 
-def _replay(log: Path, header: Header, node: str, overrides: tuple[str, ...], chain: bool, console: Console) -> _Done:
+def _replay(log: Path, header: Header, how: _How, console: Console) -> _Done:
     columns = SpinnerColumn(), TextColumn("{task.description}")
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(f"{log.name}: building nodes")
-        changed = rebuild(header, overrides) if overrides else ()
-        run = Replay(log, rebuild(header), changed=changed, only=node, chain=chain)
+        changed = rebuild(header, how.overrides, signing_key=how.key) if how.overrides else ()
+        nodes = rebuild(header, signing_key=how.key)
+        run = Replay(log, nodes, changed=changed, only=how.node, chain=how.chain)
         started, first_ns, shown_ns = time.perf_counter(), -1, 0
         for now_ns in run.run():
             first_ns = now_ns if first_ns < 0 else first_ns
@@ -103,6 +117,8 @@ def _print(done: _Done, console: Console, *, changed: bool) -> None:
         console.print(
             f"not replayed, since inputs are not stored: {missing}. That takes {RECORD_HINT}", highlight=False
         )
+    if header.signed and "AutopilotNode" in header.nodes and "AutopilotNode" not in run.reports and not run.only:
+        console.print("AutopilotNode is not replayed: a key signed its link, give it with --key")
     if run.first:
         _print_difference("[red]first difference[/]", run.first, console)
     if changed:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
+from companion.autopilot.node import AutopilotNode
 from companion.config import Config, apply_overrides, load_config
 from companion.core.errors import InputError
 from companion.core.node import Node
@@ -37,11 +38,16 @@ def read_header(log: Path) -> Header:
     return first
 
 
-def rebuild(header: Header, overrides: Sequence[str] = ()) -> list[Node]:
-    """Fresh nodes as at the beginning of the log; raises InputError for a wrong override."""
+def rebuild(header: Header, overrides: Sequence[str] = (), *, signing_key: bytes | None = None) -> list[Node]:
+    """Fresh nodes as at the beginning of the log; raises InputError for a wrong override.
+
+    Of a flight whose link was signed, AutopilotNode is left out unless the key is given.
+    """
     config: Config = apply_overrides(load_config(header.config, file="config of the log"), overrides)
     mission = parse_mission(header.mission, file="mission of the log")
-    return build(config, mission, seed=header.seed, only=kinds_of(header))
+    keyless = header.signed and signing_key is None
+    kinds = [kind for kind in kinds_of(header) if not (keyless and kind is AutopilotNode)]
+    return build(config, mission, seed=header.seed, only=kinds, signing_key=signing_key)
 
 
 def kinds_of(header: Header) -> list[type[Node]]:

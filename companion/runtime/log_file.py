@@ -46,6 +46,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     mission: str  # the text of the mission file
     config: str  # the whole configuration as YAML
+    signed: bool = False  # a key signed the link; the log does not hold it
     epoch_ns: int = 0  # offset of stamps to the monotonic clock; 0: simulated time
     version: int = VERSION
     package: str = companion.__version__

@@ -70,11 +70,11 @@ def said(path):
 def test_every_topic_is_recorded_late_ones_too(graph, endpoint, tmp_path):
     with (
         talking(graph, "/drone1/first"),
-        talking(graph, "/drone1/late", after_s=1.5),
+        talking(graph, "/drone1/late", after_s=1.0),
         talking(graph, "/drone1/_hidden"),
         talking(graph, "/drone1/mapping/local_map"),
     ):
-        result = record(endpoint, tmp_path / "a.mcap", "--for-s", "4")
+        result = record(endpoint, tmp_path / "a.mcap", "--for-s", "3")
     assert result.exit_code == 0, result.output
     found = said(tmp_path / "a.mcap")
     assert sorted(found) == ["/drone1/first", "/drone1/late"]

@@ -14,6 +14,7 @@ from companion.core.node import Topic
 from companion.mission.model import parse_mission
 from companion.runtime.clock import Clock
 from companion.runtime.codec import decode
+from companion.runtime.flight_folder import rebuild
 from companion.runtime.inbox import BULK_LIMIT, OUTSIDE, InboxLog, inbox_path
 from companion.runtime.live import LiveGroup
 from companion.runtime.log_file import End, Fed, Header, Message, entries
@@ -24,8 +25,8 @@ MISSION = "version: 1\nname: up\nsteps:\n  - {do: takeoff, alt: 1.5}\n  - {do: l
 CONTROL = tuple(kind.__name__ for kind in GROUPS["control"])
 
 
-def header(group: str, nodes: tuple[str, ...]) -> Header:
-    return Header(group=group, nodes=nodes, seed=3, mission=MISSION, config=dump_config(Config()))
+def header(group: str, nodes: tuple[str, ...], *, signed: bool = False) -> Header:
+    return Header(group=group, nodes=nodes, seed=3, mission=MISSION, config=dump_config(Config()), signed=signed)
 
 
 def messages(path: Path) -> list[Message]:
@@ -147,6 +148,27 @@ def test_a_live_group_replays_to_the_byte(tmp_path):
     assert replay.reports["PropagatorNode"].outputs > 20
     assert replay.reports["SafetyNode"].outputs > 10
     assert replay.reports["AutopilotNode"].outputs > 10
+
+
+def test_a_signed_link_replays_with_its_key_and_without_the_autopilot_node_otherwise(tmp_path):
+    path, clock, key = tmp_path / "a.log", Clock.of_host(), bytes(range(32))
+    told = header("control", CONTROL, signed=True)
+    log = InboxLog(path, told)
+    group = LiveGroup(rebuild(told, signing_key=key), clock=clock, log=log, outlets=[])
+    group.start()
+    time.sleep(0.6)
+    assert group.stop() == []
+    log.close()
+    for given, names in ((key, list(CONTROL)), (None, list(CONTROL[:-1]))):
+        replay = Replay(path, rebuild(told, signing_key=given))
+        for _ in replay.run():
+            pass
+        assert replay.identical, replay.first
+        assert list(replay.reports) == names
+    wrong = Replay(path, rebuild(told, signing_key=bytes(32)))
+    for _ in wrong.run():
+        pass
+    assert (wrong.first.node, wrong.first.topic) == ("AutopilotNode", "mavlink/tx")
 
 
 def outside(now_ns: int, k: int):
