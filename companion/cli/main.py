@@ -13,6 +13,7 @@ from companion.cli import (
     doctor,
     export,
     fly,
+    keys,
     mavlink,
     mission,
     node,
@@ -22,6 +23,7 @@ from companion.cli import (
     run,
     service,
     sim,
+    top,
     topic,
     topic_pub,
 )
@@ -39,6 +41,7 @@ app.command("sim")(sim.sim)
 app.command("record")(record.record)
 app.command("replay")(replay.replay)
 app.command("export")(export.export)
+app.command("top")(top.top)
 app.command("doctor")(doctor.doctor)
 app.command("odometry")(odometry.odometry)
 
@@ -52,6 +55,7 @@ def _group(name: str, help_text: str, **commands: object) -> None:
 
 _group("mission", "Check mission files.", check=mission.check, table=mission.table)
 _group("config", "Show the configuration.", dump=config.dump)
+_group("keys", "Make and check MAVLink signing keys.", new=keys.new, show=keys.show)
 _group("mavlink", "Look into MAVLink logs.", inspect=mavlink.inspect)
 
 _group(

@@ -27,6 +27,7 @@ from companion.report.tracks import Tracks
 from companion.runtime.bus.attach import BusOutlet, Hearing
 from companion.runtime.bus.directory import Directory
 from companion.runtime.bus.graph import Graph
+from companion.runtime.bus.reports import Reports
 from companion.runtime.bus.session import ENDPOINT, open_session
 from companion.runtime.clock import Clock
 from companion.runtime.monitor import WATCHED, Monitor
@@ -117,22 +118,24 @@ def fly_live(request: RunRequest, console: Console) -> tuple[LiveSummary, Tracks
             health=lambda m: bus.publish(topics.HEALTH, m, m.stamp_ns),
             airborne=lambda: monitor.airborne,
         )
-        lost = _fly(supervisor, monitor, tracks, clock, console)
+        reports = Reports(graph, clock=clock, vehicle=request.vehicle)
+        lost = _fly(supervisor, monitor, tracks, reports, console)
         return write_live(request, supervisor, monitor, tracks, lost), tracks
 
 
-def _fly(supervisor: Supervisor, monitor: Monitor, tracks: Tracks, clock: Clock, console: Console) -> str:
+def _fly(supervisor: Supervisor, monitor: Monitor, tracks: Tracks, reports: Reports, console: Console) -> str:
     """Start, watch and end the groups; returns why the flight was lost, or ''."""
     lost, told = "", 0
     with _interrupts() as interrupts, console.status("starting") as status:
         try:
             status.update("compiling kernels (first start: up to a minute of CPU; cached afterwards)")
             supervisor.start()
-            tracks.zero_ns = clock.now_ns()
+            tracks.zero_ns = reports.clock.now_ns()
             while not monitor.over and not lost and interrupts.count < 2:
                 lost = supervisor.watch()
                 monitor.look()
-                told = _tell(supervisor, told, console)
+                reports.look(supervisor.reports())
+                told = _tell(supervisor, told, reports, console)
                 _show(status, monitor)
                 if interrupts.count == 1 and not interrupts.answered:
                     interrupts.answered = True
@@ -145,14 +148,15 @@ def _fly(supervisor: Supervisor, monitor: Monitor, tracks: Tracks, clock: Clock,
             status.update("ending")
             killed = supervisor.stop()
             monitor.look()
-            _tell(supervisor, told, console)
+            _tell(supervisor, told, reports, console)
     if killed:
         console.print(f"had to be killed: {', '.join(killed)}")
     return lost
 
 
-def _tell(supervisor: Supervisor, told: int, console: Console) -> int:
+def _tell(supervisor: Supervisor, told: int, reports: Reports, console: Console) -> int:
     for event in supervisor.events[told:]:
+        reports.event(event)
         console.print(event, highlight=False, markup=False)
     return len(supervisor.events)
 

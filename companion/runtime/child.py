@@ -23,6 +23,7 @@ class Child:
         self.started_s = time.monotonic()
         self.beat: Beat | None = None
         self.figures: dict[str, float] = {}  # the newest
+        self.figures_ns = 0  # their stamp
         self.warm_cpu_s = 0.0  # spent before it ran
         self.running_s = 0.0  # since it ran, at the last beat
         self._beat_s, self._ran_s = self.started_s, 0.0
@@ -113,5 +114,6 @@ class Child:
             self.running_s = self._beat_s - self._ran_s
         elif beat.state != "stopping":
             self.warm_cpu_s = beat.cpu_s
-        self.figures = beat.figures or self.figures
+        if beat.figures:
+            self.figures, self.figures_ns = beat.figures, beat.stamp_ns
         self.beat = beat

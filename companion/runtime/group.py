@@ -42,6 +42,7 @@ from companion.runtime.no_log import NoLog
 from companion.runtime.pipes import Assignment, Beat, NodeBeat, Word
 from companion.runtime.ports.key_file import load_key
 from companion.runtime.priority import run_first
+from companion.runtime.pulse import Pulse
 from companion.runtime.vehicle_link import VehicleLink
 from companion.stack import GROUPS, build, warm
 
@@ -122,8 +123,9 @@ class Process:
         scene = SceneOutlet(graph, published, name=f"{a.group}_scene", vehicle=a.vehicle)
         if a.link:
             scene.show_sensors(self._config.rig, self._clock.now_ns())
-        outlets: list[Outlet] = [bus, self._latency, scene]
-        self._figures += [bus.figures, self._latency.figures]
+        pulse = Pulse()
+        outlets: list[Outlet] = [bus, self._latency, pulse, scene]
+        self._figures += [bus.figures, self._latency.figures, lambda: pulse.figures("published")]
         if a.link:
             self._link = stack.enter_context(VehicleLink(a.link, clock=self._clock))
             outlets.append(self._link)
@@ -146,6 +148,7 @@ class Process:
             seed=a.seed,
             mission=a.mission,
             config=dump_config(self._config),
+            signed=bool(a.key_file),
             epoch_ns=a.clock_offset_ns,
         )
         return stack.enter_context(closing(InboxLog(inbox_path(Path(a.out), a.group), header)))

@@ -21,6 +21,7 @@ from companion.core.messages import NodeHealth
 from companion.core.node import Node
 from companion.runtime.child import Child
 from companion.runtime.clock import Clock
+from companion.runtime.diagnostics import GroupReport
 from companion.runtime.pipes import Assignment
 from companion.stack import GROUPS
 
@@ -70,6 +71,21 @@ class Supervisor:
     def restarts(self) -> dict[str, int]:
         """Starts beyond the first, per group."""
         return {name: seat.restarts for name, seat in self._seats.items()}
+
+    def reports(self) -> list[GroupReport]:
+        """How every group does now."""
+        return [
+            GroupReport(
+                group=name,
+                pid=seat.child.pid,
+                restarts=seat.restarts,
+                down=seat.down,
+                beat=seat.child.beat,
+                figures=seat.child.figures,
+                figures_ns=seat.child.figures_ns,
+            )
+            for name, seat in self._seats.items()
+        ]
 
     def start(self) -> None:
         """Spawn every group; let all go when all are warm. Raises GroupError if one ends or does not get ready."""

@@ -15,6 +15,7 @@ from companion.core import topics
 from companion.core.node import Service, Topic
 from companion.runtime.bus.gaps import Gaps
 from companion.runtime.bus.graph import Arrival, Graph, Publisher, Urgency
+from companion.runtime.pulse import Pulse
 from companion.runtime.wire import codec_of
 from companion.runtime.wire.keys import qos_of
 
@@ -80,6 +81,7 @@ class Hearing:
     ) -> None:
         self.heard: Counter[str] = Counter()
         self._gaps = {topic.name: Gaps() for topic in wanted}
+        self._pulse = Pulse(topic for topic in wanted if topic not in LINK_ONLY)
         self._receiver = receiver
         entity = graph.node(listener, namespace=f"/{vehicle}")
         for topic in wanted:
@@ -94,7 +96,7 @@ class Hearing:
     def figures(self) -> dict[str, float]:
         """Samples heard and lost."""
         totals: dict[str, float] = {"bus_heard": sum(self.heard.values()), "bus_lost": sum(self.lost.values())}
-        return totals | {f"lost {topic}": count for topic, count in self.lost.items()}
+        return totals | {f"lost {topic}": count for topic, count in self.lost.items()} | self._pulse.figures("heard")
 
     def _subscribe(self, entity: Any, topic: Topic[Any], vehicle: str) -> None:
         decode = codec_of(topic).decode
@@ -102,6 +104,7 @@ class Hearing:
         def take(arrival: Arrival) -> None:
             self.heard[topic.name] += 1
             self._gaps[topic.name].note(arrival.attachment)
+            self._pulse.publish(topic, arrival.payload, 0)
             self._receiver.receive(topic, arrival.payload, decode=decode)
 
         entity.subscribe(bus_name(topic, vehicle), codec_of(topic).type, qos_of(topic), take)
