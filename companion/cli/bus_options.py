@@ -18,8 +18,8 @@ from companion.runtime.bus.session import ENDPOINT
 Bus = Annotated[str, typer.Option("--bus", help="Zenoh endpoint of the bus.")]
 Vehicle = Annotated[str, typer.Option("--name", help="Vehicle whose topics need no /NAME/ before them.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, one object per line.")]
-ForS = Annotated[float, typer.Option("--for-s", min=0, help="End after so many seconds [at Ctrl-C].")]
-Count = Annotated[int, typer.Option("-n", "--count", min=0, help="End after so many messages [at Ctrl-C].")]
+ForS = Annotated[float, typer.Option("--for-s", min=0, help="End after so many seconds (0: at Ctrl-C).")]
+Count = Annotated[int, typer.Option("-n", "--count", min=0, help="End after so many messages (0: at Ctrl-C).")]
 
 BUS, VEHICLE = ENDPOINT, "drone1"
 
