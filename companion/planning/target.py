@@ -24,11 +24,11 @@ def ground_below(local_map: LocalMap, p_odom: Array, *, within_m: float, fallbac
 
 
 def at_height(p_odom: Array, agl_m: float, local_map: LocalMap, *, within_m: float, fallback_z: float) -> Array:
-    """The goal with its z from the ground under it, if a height above ground is asked for."""
+    """The goal with its z from the ground under it, if a height above ground is asked for and ground was seen."""
     if math.isnan(agl_m):
         return p_odom
     z = ground_below(local_map, p_odom, within_m=within_m, fallback_z=fallback_z) + agl_m
-    return np.array([p_odom[0], p_odom[1], z])
+    return p_odom if math.isnan(z) else np.array([p_odom[0], p_odom[1], z])
 
 
 def place_for(

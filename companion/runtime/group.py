@@ -239,8 +239,8 @@ def lines_of(descriptor: int) -> Iterator[bytes]:
 
 
 def in_the_air(config: Config) -> Config:
-    """A map that begins in flight knows nothing but where the vehicle is."""
-    mapping = msgspec.structs.replace(config.mapping, start_free_radius_m=config.hull_radius_m, start_free_height_m=0.0)
+    """The map begins in flight: the vehicle came here through known-free space, but of what is above nobody knows."""
+    mapping = msgspec.structs.replace(config.mapping, start_free_height_m=0.0)
     return msgspec.structs.replace(config, mapping=mapping)
 
 

@@ -52,6 +52,7 @@ class Middleman:
     def __init__(self, *, towards: Address, seed: int, faults: Faults | None = None) -> None:
         self.up = self.down = faults or Faults()  # vehicle -> stack, stack -> vehicle
         self.up_count, self.down_count = Count(), Count()
+        self.to_vehicle: list[tuple[float, bytes]] = []  # (monotonic s, datagram) of everything that went down
         self._towards, self._vehicle = towards, None
         self._rng = {"up": np.random.default_rng([seed, 0]), "down": np.random.default_rng([seed, 1])}
         self._front, self._back = self._socket(), self._socket()
@@ -132,5 +133,7 @@ class Middleman:
         try:
             sock.sendto(data, target)
             count.passed += 1
+            if direction == "down":
+                self.to_vehicle.append((time.monotonic(), data))
         except OSError:
             count.lost += 1
