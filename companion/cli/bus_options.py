@@ -22,6 +22,7 @@ ForS = Annotated[float, typer.Option("--for-s", min=0, help="End after so many s
 Count = Annotated[int, typer.Option("-n", "--count", min=0, help="End after so many messages (0: at Ctrl-C).")]
 
 BUS, VEHICLE = ENDPOINT, "drone1"
+_CONTROLS = {code: "\N{REPLACEMENT CHARACTER}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
 
 
 @contextmanager
@@ -43,8 +44,11 @@ def stopping() -> Iterator[Event]:
 
 
 def say(line: str) -> None:
-    """One line on standard output, at once: a pipe must not hold it back."""
-    print(line, flush=True)
+    """One line on standard output, at once: a pipe must not hold it back.
+
+    Strangers' names and words reach no terminal with control characters in them.
+    """
+    print(line.translate(_CONTROLS), flush=True)
 
 
 def warn(line: str) -> None:

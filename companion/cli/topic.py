@@ -216,8 +216,7 @@ def _measure(desk: Desk, view: View, kind: WireType | Named, meter: Meter, limit
     with stopping() as stopped:
         for heard in ear.until(stopped, limits):
             if heard is not None:
-                meter.add(heard)
-                fresh += 1
+                fresh += _added(meter, heard)
             else:
                 tell(fresh)
                 fresh = 0
@@ -225,6 +224,15 @@ def _measure(desk: Desk, view: View, kind: WireType | Named, meter: Meter, limit
             raise error
         if fresh:
             tell(fresh)
+
+
+def _added(meter: Meter, heard: Heard) -> bool:
+    try:
+        meter.add(heard)
+    except WireError as error:
+        warn(f"one message is none: {error}")
+        return False
+    return True
 
 
 def _report(meter: Meter, fresh: int, *, as_json_: bool) -> None:

@@ -29,7 +29,13 @@ from companion.core.node import Topic
 from companion.core.rig import Mount, Rig
 
 _FLOAT32 = 7  # sensor_msgs/PointField
-_INFO = 20  # rcl_interfaces/Log
+_INFO, _WARN, _ERROR = 20, 30, 40  # rcl_interfaces/Log
+_LEVELS = {  # of what an operator must see; every other decision is information
+    ("SensorsNode", "sensor fault"): _WARN,
+    ("safety", "slow"): _WARN,
+    ("safety", "hold"): _WARN,
+    ("safety", "land"): _ERROR,
+}
 _OCCUPIED = 2  # LocalMap.state
 
 
@@ -118,7 +124,8 @@ def _goal(g: Goal) -> Iterator[View]:
 
 def _why(w: Why) -> Iterator[View]:
     text = f"{w.what}: {w.because}"
-    value = {"stamp": _header(w.stamp_ns, "")["stamp"], "level": _INFO, "name": w.node, "msg": text}
+    level = _LEVELS.get((w.node, w.what), _INFO)
+    value = {"stamp": _header(w.stamp_ns, "")["stamp"], "level": level, "name": w.node, "msg": text}
     yield View("rosout", "rcl_interfaces/msg/Log", value, shared=True)
 
 

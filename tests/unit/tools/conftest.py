@@ -1,4 +1,4 @@
-"""A bus of its own for each test, with a node that talks; the tools run in this process."""
+"""A bus of our own, on which each test declares its nodes; the tools run in this process."""
 
 import contextlib
 import json
@@ -9,7 +9,7 @@ import time
 import pytest
 from typer.testing import CliRunner
 
-from companion.cli.main import app
+from companion.cli import main
 from companion.runtime.bus.graph import Graph
 from companion.runtime.bus.session import open_session
 from companion.runtime.wire import wire_type
@@ -17,17 +17,36 @@ from companion.runtime.wire.keys import Qos
 from companion.runtime.wire.type_hash import _individual
 
 
-@pytest.fixture
-def endpoint():
+def free_endpoint():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+@pytest.fixture(scope="session")
+def bus():
+    """(endpoint, session of the router): opened once, since opening takes half a second."""
+    endpoint = free_endpoint()
+    with open_session("router", endpoint=endpoint) as session:
+        yield endpoint, session
+
+
 @pytest.fixture
-def graph(endpoint):
-    with open_session("router", endpoint=endpoint) as session, Graph(session) as graph:
+def endpoint(bus):
+    return bus[0]
+
+
+@pytest.fixture
+def graph(bus):
+    """What a test declares; gone after it."""
+    with Graph(bus[1]) as graph:
         yield graph
+
+
+@pytest.fixture
+def nowhere():
+    """An endpoint where nobody listens."""
+    return free_endpoint()
 
 
 class Result:
@@ -48,9 +67,10 @@ class Result:
 @pytest.fixture
 def companion(endpoint):
     """Run a command line on the test's bus."""
+    whole = main.app
 
-    def run(*arguments):
-        return Result(CliRunner().invoke(app, [*arguments, "--bus", endpoint]))
+    def run(*arguments, bus=endpoint):
+        return Result(CliRunner().invoke(whole, [*arguments, "--bus", bus]))
 
     return run
 

@@ -60,9 +60,9 @@ def test_a_wrong_name_gives_the_nearest_ones(graph, companion):
     assert "lio_state" not in str(error)
 
 
-def test_no_bus_is_said_and_ends_with_3(companion):
-    for command in (("topic", "list"), ("topic", "echo", "x"), ("topic", "hz", "x")):
-        error = companion(*command).error
+def test_no_bus_is_said_and_ends_with_3(companion, nowhere):
+    for command in (("topic", "list"), ("topic", "hz", "x")):
+        error = companion(*command, bus=nowhere).error
         assert isinstance(error, LinkError)
         assert error.exit_code == 3
         assert "companion sim" in str(error)
@@ -152,6 +152,29 @@ def test_delay_is_that_of_the_stamp_and_of_the_sending(talking, companion):
     assert 0.050 <= last["stamp_min_s"] < 0.070
     assert 0.0 < last["sent_min_s"] < 0.020
     assert last["stamp_mean_s"] - last["sent_mean_s"] == pytest.approx(0.05, abs=0.005)
+
+
+def test_a_payload_that_is_none_is_reported_and_passed_over(graph, talking, companion):
+    twist = wire_type("geometry_msgs/msg/TwistStamped")
+
+    class Broken:
+        name, dds_name, type_hash = twist.name, twist.dds_name, twist.type_hash
+
+        def encode(self, value):
+            return b"none" if value["twist"]["linear"]["x"] % 2 else twist.encode(value)
+
+    with talking("/drone1/twist", Broken(), stamped):
+        echoed = companion("topic", "echo", "twist", "-n", "6", "--field", "twist.linear.x", "--csv")
+        measured = companion("topic", "delay", "twist", "-n", "6", "--json")
+    assert len(echoed.lines) == 3
+    assert all(float(x) % 2 == 0 for x in echoed.lines)
+    assert measured.rows[-1]["window"] == 3
+
+
+def test_control_characters_of_strangers_reach_no_terminal(talking, companion):
+    with talking("/drone1/said", TEXT, lambda k: {"data": "a\x1b[31mb"}):
+        lines = companion("topic", "echo", "said", "--once", "--csv").lines
+    assert lines == ["a\N{REPLACEMENT CHARACTER}[31mb"]
 
 
 def test_delay_of_a_type_without_header_is_refused(talking, companion):
