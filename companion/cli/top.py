@@ -48,7 +48,7 @@ def top(
         if once:
             _print(seen.picture(time.monotonic_ns()), as_json_=as_json_)
         elif as_json_ or not sys.stdout.isatty():
-            for picture in _pictures(seen, stopped, for_s):
+            for picture in _pictures(seen, stopped.is_set, for_s):
                 _print(picture, as_json_=as_json_)
         else:
             _watch(seen, stopped, for_s)
@@ -62,12 +62,12 @@ def _settle(seen: Top, stopped: Event) -> None:
     seen.look_around()
 
 
-def _pictures(seen: Top, stopped: Event, for_s: float) -> Iterator[Picture]:
-    """One per report, or one per second while there are none."""
+def _pictures(seen: Top, over: Callable[[], bool], for_s: float) -> Iterator[Picture]:
+    """One per report, or one per second while there are none; `over` is asked ten times a second."""
     begin_s = time.monotonic()
     shown_s = around_s = begin_s
     yield seen.picture(time.monotonic_ns())
-    while not stopped.is_set() and not 0 < for_s <= time.monotonic() - begin_s:
+    while not over() and not 0 < for_s <= time.monotonic() - begin_s:
         fresh, now_s = seen.wait(KEY_S), time.monotonic()
         if now_s - around_s > LOOK_AROUND_S:
             seen.look_around()
@@ -79,10 +79,8 @@ def _pictures(seen: Top, stopped: Event, for_s: float) -> Iterator[Picture]:
 
 def _watch(seen: Top, stopped: Event, for_s: float) -> None:
     with _keys() as pressed, Live(screen=True, auto_refresh=False) as live:
-        for picture in _pictures(seen, stopped, for_s):
+        for picture in _pictures(seen, lambda: stopped.is_set() or pressed("q"), for_s):
             live.update(_drawn(picture), refresh=True)
-            if pressed("q"):
-                return
 
 
 @contextmanager

@@ -52,7 +52,7 @@ def await_subscriptions(
             return
         if time.monotonic() > until_s:
             raise LinkError(
-                f"{heard_by} of {wanted} subscriptions to {topic} after {timeout_s:g} s: -w 0 publishes to nobody, too"
+                f"{heard_by} of {wanted} subscriptions to {topic} after {timeout_s:g} s: -w 0 publishes without waiting"
             )
         stopped.wait(LOOK_S)
 
