@@ -1,7 +1,7 @@
 """Writes the generated pages of docs/: run `python docs/generate.py` after a change of the code.
 
-What flights gave comes from the folders of flights: `python docs/generate.py flights/demo flights/look`.
-Where README and docs say `<!-- table: MISSION -->` or `<!-- why: MISSION -->` the block that follows is
+What flights gave comes from the folders of flights: `python docs/generate.py flights/demo flights/look flights/live`.
+Where README and docs say `<!-- table: MISSION -->` or `<!-- why: MISSION -->` (`<!-- table: live -->`) the block that follows is
 replaced; the first folder also gives docs/reference/performance.md. A test compares the other pages
 with the code.
 """
@@ -16,10 +16,13 @@ from typing import Any
 
 import msgspec
 from rich.console import Console
+from rich.table import Table
 
+from companion.cli.live_outcome import live_table
 from companion.cli.outcome import outcome_table
 from companion.config import Config, dump_config
 from companion.core import topics
+from companion.report.live_summary import LiveSummary
 from companion.report.summary import Summary
 
 DOCS = Path(__file__).resolve().parent
@@ -100,11 +103,21 @@ def pages() -> dict[Path, str]:
 
 def flown_blocks(folder: Path, flown: Summary) -> dict[str, str]:
     """Marker -> what stands in the block after it."""
-    console = Console(file=StringIO(), width=100, color_system=None)
-    console.print(outcome_table(flown, folder / "flight.png"))
-    table = "\n".join(line.rstrip() for line in console.file.getvalue().splitlines())
+    table = _as_text(outcome_table(flown, folder / "flight.png"))
     reasons = (folder / "why.log").read_text(encoding="utf-8").splitlines()
     return {f"table: {flown.mission}": table, f"why: {flown.mission}": "\n".join([*reasons[:6], "...", *reasons[-2:]])}
+
+
+def live_blocks(folder: Path) -> dict[str, str]:
+    """The same of a live flight."""
+    flown = msgspec.json.decode((folder / "summary.json").read_bytes(), type=LiveSummary)
+    return {"table: live": _as_text(live_table(flown, folder))}
+
+
+def _as_text(table: Table) -> str:
+    console = Console(file=StringIO(), width=100, color_system=None)
+    console.print(table)
+    return "\n".join(line.rstrip() for line in console.file.getvalue().splitlines())
 
 
 def put_blocks(text: str, blocks: dict[str, str]) -> str:
@@ -121,11 +134,18 @@ def main() -> None:
         path.write_text(text, encoding="utf-8")
     folders = [Path(folder) for folder in sys.argv[1:]]
     for folder in folders:
+        if list(folder.glob("inbox-*.log")):
+            _fill(live_blocks(folder))
+            continue
         flown = msgspec.json.decode((folder / "summary.json").read_bytes(), type=Summary)
         if folder is folders[0]:
             (DOCS / "reference/performance.md").write_text(performance_page(flown), encoding="utf-8")
-        for page in (DOCS.parent / "README.md", *DOCS.glob("*.md")):
-            page.write_text(put_blocks(page.read_text(encoding="utf-8"), flown_blocks(folder, flown)), encoding="utf-8")
+        _fill(flown_blocks(folder, flown))
+
+
+def _fill(blocks: dict[str, str]) -> None:
+    for page in (DOCS.parent / "README.md", *DOCS.glob("*.md")):
+        page.write_text(put_blocks(page.read_text(encoding="utf-8"), blocks), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -75,6 +75,11 @@ def print_live(summary: LiveSummary, out: Path, console: Console, *, as_json: bo
     if as_json:
         typer.echo(to_json(summary))
         return
+    console.print(live_table(summary, out))
+
+
+def live_table(summary: LiveSummary, out: Path) -> Table:
+    """What a live flight came to, label and text."""
     f, gap, age = summary.figures, summary.setpoint_gap_ms, summary.sweep_to_setpoint_ms
     rows = {
         "completed": "[green]yes[/]" if summary.completed else f"[red]no[/]: {summary.reason}",
@@ -92,7 +97,7 @@ def print_live(summary: LiveSummary, out: Path, console: Console, *, as_json: bo
     table = Table(show_header=False, box=None, pad_edge=False)
     for label, text in rows.items():
         table.add_row(f"[bold]{label}[/]", text)
-    console.print(table)
+    return table
 
 
 def _percentiles(figures: dict[str, float]) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.core import topics
 from companion.runtime.bus.attach import Hearing
 from companion.runtime.bus.graph import Graph
 from companion.runtime.bus.session import open_session
@@ -49,7 +50,8 @@ class Flight:
         self.bus = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.port = free_port(socket.SOCK_DGRAM)
         self.line = middleman.Middleman(towards=("127.0.0.1", self.port), seed=1)
-        self.monitor = Monitor()
+        self.plan = None  # the newest PlanStatus
+        self.monitor = Monitor([self])
         (folder / "mission.yaml").write_text(MISSION)
         self._processes, self._world, self._options = {}, world, options
         self._session = self._graph = None
@@ -76,6 +78,10 @@ class Flight:
             self._graph.__exit__(None, None, None)
             self._session.close()
         self.line.__exit__(None, None, None)
+
+    def heard(self, topic, message):
+        if topic is topics.PLAN:
+            self.plan = message
 
     def start_run(self, name):
         return self._start(name, "run", str(self.folder / "mission.yaml"), f"--vehicle=udp://127.0.0.1:{self.port}",

@@ -7,6 +7,9 @@ import time
 
 import pytest
 
+from companion.runtime.flight_folder import read_header, rebuild
+from companion.runtime.replay import Replay
+
 
 def test_a_killed_planner_stops_the_vehicle_and_the_mission_goes_on(flight, speed_of):
     flight.flies()
@@ -26,6 +29,17 @@ def test_a_killed_planner_stops_the_vehicle_and_the_mission_goes_on(flight, spee
     summary = flight.summary()
     assert summary["completed"] and not summary["contact"]
     assert summary["restarts"] == {"world": 1}
+    replayed = [log for log in sorted(flight.out.glob("inbox-*.log")) if _replays(log)]
+    assert len(replayed) == 5, "four groups, one of them twice"
+
+
+def _replays(log):
+    """Every node of a live process gives the same bytes again, also of one that was killed."""
+    replay = Replay(log, rebuild(read_header(log)))
+    for _ in replay.run():
+        pass
+    assert replay.first is None, f"{log.name}: {replay.first}"
+    return sum(report.outputs for report in replay.reports.values()) > 50
 
 
 def test_a_stopped_estimator_gives_no_stale_setpoint(flight, speed_of):

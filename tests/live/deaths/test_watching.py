@@ -1,0 +1,51 @@
+"""Other processes beside a live flight: they see it, and one speaks into it."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+PAGE = Path(__file__).resolve().parents[3] / "docs/live.md"
+SHOWN = re.findall(r"^\$ \.venv/bin/companion ((?:topic|node|top|record)\b.*)$", PAGE.read_text(), re.MULTILINE)
+
+
+def companion(flight, *arguments):
+    """Standard output of a tool on the flight's bus."""
+    command = [sys.executable, "-m", "companion", *arguments, f"--bus={flight.bus}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=flight.folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_live_flight_is_watched_and_told_to_hold_from_other_processes(flight):
+    flight.flies(1.0)
+    rates = [
+        json.loads(line)
+        for line in companion(flight, "topic", "hz", "estimation/odometry", "--for-s=4", "--json").splitlines()
+    ]
+    assert 60 < rates[-1]["rate_hz"] < 140
+    echo = json.loads(companion(flight, "topic", "echo", "autopilot/vehicle", "--once", "--json"))
+    assert echo["mode"] == "OFFBOARD" and echo["armed"]
+    listed = companion(flight, "topic", "list", "-t")
+    assert (
+        "/drone1/tracking/setpoint [understory_msgs/msg/Setpoint]" in listed
+        and "/tf [tf2_msgs/msg/TFMessage]" in listed
+    )
+    bandwidth = json.loads(companion(flight, "topic", "bw", "sensors/lidar", "--for-s=3", "--json").splitlines()[-1])
+    assert bandwidth["window"] > 5 and bandwidth["bytes_per_s"] > 1e5
+    info = companion(flight, "topic", "info", "mission/goal", "-v")
+    assert "MissionNode" in info and "world_inbox" in info
+    limits = "{speed: 1, climb: 1, accel: 2, yaw_rate: 1, clearance: 0.4, unknown: stop_before, agl_max: 30}"
+    hold = f"{{id: 4711, kind: hold, p_odom: [0, 0, 2], if_blocked: fail, limits: {limits}}}"
+    companion(flight, "topic", "pub", "mission/goal", "understory_msgs/msg/Goal", hold, "--once")
+    flight.until(lambda: (p := flight.plan) is not None and p.goal_id == 4711, "the planner's word on that goal", 20.0)
+
+
+def test_what_the_page_shows_works_beside_a_flight(flight):
+    assert len(SHOWN) >= 8
+    flight.flies(1.0)
+    for command in SHOWN:
+        assert companion(flight, *shlex.split(command)).strip() or command.startswith("record"), command
+    assert (flight.folder / "watched.mcap").stat().st_size > 100_000
