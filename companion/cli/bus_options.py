@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from threading import Event
 from types import FrameType
 from typing import Annotated
@@ -15,7 +16,10 @@ from rich.console import Console
 from companion.core.errors import CompanionError
 from companion.runtime.bus.session import ENDPOINT
 
-Bus = Annotated[str, typer.Option("--bus", help="Zenoh endpoint of the bus.")]
+Bus = Annotated[str, typer.Option("--bus", help="Zenoh endpoint of the bus; of a ground link: tls/HOST:7448.")]
+Certs = Annotated[
+    Path | None, typer.Option("--certs", help="Certificates for a ground link: DIR, or DIR/NAME; see `companion keys`.")
+]
 Vehicle = Annotated[str, typer.Option("--name", help="Vehicle whose topics need no /NAME/ before them.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, one object per line.")]
 ForS = Annotated[float, typer.Option("--for-s", min=0, help="End after so many seconds (0: at Ctrl-C).")]

@@ -30,7 +30,10 @@ COMMANDS = {  # command -> module and function in companion.cli
 GROUPS = {  # group -> help, command -> module and function
     "mission": ("Check mission files.", {"check": "mission:check", "table": "mission:table"}),
     "config": ("Show the configuration.", {"dump": "config:dump"}),
-    "keys": ("Make and check MAVLink signing keys.", {"new": "keys:new", "show": "keys:show"}),
+    "keys": (
+        "Make and check keys: of MAVLink signing, and of the ground link.",
+        {"new": "keys:new", "ca": "keys:ca", "cert": "keys:cert", "show": "keys:show"},
+    ),
     "mavlink": ("Look into MAVLink logs.", {"inspect": "mavlink:inspect"}),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",

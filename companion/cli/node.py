@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from companion.cli.bus_options import BUS, VEHICLE, Bus, Json, Vehicle, say, warn
+from companion.cli.bus_options import BUS, VEHICLE, Bus, Certs, Json, Vehicle, say, warn
 from companion.runtime.tools.desk import Desk
 from companion.runtime.tools.names import find, is_hidden, nodes_of
 from companion.runtime.wire.keys import Entity, Kind
@@ -20,13 +20,14 @@ PARTS: tuple[tuple[str, Kind], ...] = (
 def list_nodes(
     everything: Annotated[bool, typer.Option("--all", "-a", help="Hidden nodes, too.")] = False,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """List the nodes on the bus. Example: companion node list
 
     Exit code 3: no bus is there.
     """
-    with Desk(bus) as desk:
+    with Desk(bus, certs=certs) as desk:
         nodes = nodes_of(desk.entities())
     for name, entities in nodes.items():
         if is_hidden(name) and not everything:
@@ -45,13 +46,14 @@ def info(
     name: Annotated[str, typer.Argument(metavar="NODE", help="Node, such as /drone1/LioNode or LioNode.")],
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """Show what a node publishes, subscribes to, serves and calls. Example: companion node info LioNode
 
     Exit code 2: no such node; 3: no bus.
     """
-    with Desk(bus) as desk:
+    with Desk(bus, certs=certs) as desk:
         nodes = nodes_of(desk.entities())
     found = find(name, list(nodes), vehicle=vehicle, what="node")
     if as_json_:

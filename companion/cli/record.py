@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from companion.cli.bus_options import BUS, VEHICLE, Bus, ForS, Vehicle, stopping
+from companion.cli.bus_options import BUS, VEHICLE, Bus, Certs, ForS, Vehicle, stopping
 from companion.core.errors import CompanionError
 from companion.runtime.bus_recording import BusRecording
 from companion.runtime.recorder import Recorder
@@ -30,6 +30,7 @@ def record(
     for_s: ForS = 0.0,
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
 ) -> None:
     """Record TOPICS from the bus until Ctrl-C. Example: companion record --out flight.mcap
 
@@ -39,7 +40,7 @@ def record(
     """
     path = out or Path(f"{datetime.now():%Y-%m-%d-%H%M%S}.mcap")
     console = Console(stderr=True)
-    with Desk(bus) as desk, stopping() as stopped:
+    with Desk(bus, certs=certs) as desk, stopping() as stopped:
         recorder = Recorder(path, split_bytes=split_mb * 1_000_000, split_s=split_s)
         try:
             recording = BusRecording(desk, recorder, wanted=topics or (), vehicle=vehicle)

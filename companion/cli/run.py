@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.status import Status
 
 from companion.cli.flight_input import read_text, stack_config
+from companion.cli.ground_options import Allowed, Certificates, Rates, ground_settings
 from companion.cli.live_outcome import print_live, write_live
 from companion.config import Config, dump_config
 from companion.core import topics
@@ -27,6 +28,7 @@ from companion.report.tracks import Tracks
 from companion.runtime.bus.attach import BusOutlet, Hearing
 from companion.runtime.bus.directory import Directory
 from companion.runtime.bus.graph import Graph
+from companion.runtime.bus.ground import GroundSettings, open_ground
 from companion.runtime.bus.reports import Reports
 from companion.runtime.bus.session import ENDPOINT, open_session
 from companion.runtime.clock import Clock
@@ -54,6 +56,7 @@ class RunRequest:
     out: Path
     log: bool
     key_file: str = ""
+    ground: GroundSettings | None = None
 
 
 def run(
@@ -68,6 +71,12 @@ def run(
     bus: Annotated[str, typer.Option(help="Zenoh endpoint of the bus.")] = ENDPOINT,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the planner.")] = 0,
     key: Annotated[Path | None, typer.Option(help="Key file that signs MAVLink; see `companion keys`.")] = None,
+    ground: Annotated[
+        str, typer.Option(help="Telemetry for ground stations on tls/HOST:PORT, such as tls/0.0.0.0:7448.")
+    ] = "",
+    ground_certs: Certificates = None,
+    ground_rate: Rates = None,
+    ground_allow: Allowed = None,
     log: Annotated[bool, typer.Option(help="Write what `companion replay` needs.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
@@ -90,6 +99,7 @@ def run(
         out=out or Path("flights") / f"{datetime.now():%Y-%m-%d-%H%M%S}-{parsed.name}",
         log=log,
         key_file=str(key.resolve()) if key else "",
+        ground=ground_settings(ground, ground_certs, ground_rate or (), ground_allow or (), bus=bus, vehicle=name),
     )
     if key:
         load_key(key)  # a bad one is told now, not by a child
@@ -108,6 +118,8 @@ def fly_live(request: RunRequest, console: Console) -> tuple[LiveSummary, Tracks
         session = stack.enter_context(open_session("first", endpoint=request.bus))
         graph = stack.enter_context(Graph(session))
         _refuse_a_second(Directory(graph), request)
+        if request.ground:
+            stack.enter_context(open_ground(request.ground, bus=request.bus, vehicle=request.vehicle))
         tracks = Tracks()
         monitor = Monitor([tracks])
         Hearing(graph, WATCHED, monitor, listener="monitor", vehicle=request.vehicle)

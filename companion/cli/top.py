@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from companion.cli.bus_options import BUS, Bus, ForS, Json, say, stopping
+from companion.cli.bus_options import BUS, Bus, Certs, ForS, Json, say, stopping
 from companion.runtime.tools.desk import Desk
 from companion.runtime.tools.show import as_json
 from companion.runtime.tools.top import OLD_S, Picture, Status, Top
@@ -35,6 +35,7 @@ def top(
     once: Annotated[bool, typer.Option("--once", help="Print it once, then end.")] = False,
     for_s: ForS = 0.0,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """Watch nodes, CPU, rates, deadlines, restarts and drops of a live stack. Example: companion top
@@ -42,7 +43,7 @@ def top(
     q or Ctrl-C ends it. The figures are those of `/diagnostics`, which `companion run` publishes once per second.
     Exit code 3: no bus is there.
     """
-    with Desk(bus) as desk, stopping() as stopped:
+    with Desk(bus, certs=certs) as desk, stopping() as stopped:
         seen = Top(desk)
         _settle(seen, stopped)
         if once:

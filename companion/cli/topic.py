@@ -11,7 +11,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.bus_options import BUS, VEHICLE, Bus, Count, ForS, Json, Vehicle, nothing_heard, say, stopping, warn
+from companion.cli.bus_options import (
+    BUS,
+    VEHICLE,
+    Bus,
+    Certs,
+    Count,
+    ForS,
+    Json,
+    Vehicle,
+    nothing_heard,
+    say,
+    stopping,
+    warn,
+)
 from companion.runtime.tools.desk import Desk
 from companion.runtime.tools.ear import Heard, Limits, listen
 from companion.runtime.tools.kinds import Named, message_type
@@ -30,13 +43,14 @@ def list_topics(
     verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Types and counts.")] = False,
     everything: Annotated[bool, typer.Option("--all", help="Hidden topics, too.")] = False,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """List the topics on the bus. Example: companion topic list -t
 
     Exit code 3: no bus is there.
     """
-    with Desk(bus) as desk:
+    with Desk(bus, certs=certs) as desk:
         views = [v for v in topics_of(desk.entities()) if everything or not v.hidden]
     if as_json_:
         for v in views:
@@ -57,13 +71,14 @@ def info(
     verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Nodes, ids and QoS of every endpoint.")] = False,
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """Show who publishes and who subscribes. Example: companion topic info sensors/imu -v
 
     Exit code 2: no such topic; 3: no bus.
     """
-    with Desk(bus) as desk:
+    with Desk(bus, certs=certs) as desk:
         view = find_view(topics_of(desk.entities()), name, vehicle=vehicle)
     if as_json_:
         publishers, subscriptions = ([_described(e) for e in ends] for ends in (view.givers, view.takers))
@@ -108,13 +123,14 @@ def echo(
     raw: Annotated[bool, typer.Option("--raw", help="The bytes; needs no type.")] = False,
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
 ) -> None:
     """Print messages as they come. Example: companion topic echo estimation/odometry --field p_odom
 
     Long arrays are cut after 128 elements, except in JSON.
     Exit code 1: no message came in the time; 2: no such topic or field; 3: no bus.
     """
-    with Desk(bus) as desk, stopping() as stopped:
+    with Desk(bus, certs=certs) as desk, stopping() as stopped:
         view, everyone = _found(desk, name, vehicle)
         kind = None if raw else message_type(desk, view.givers or view.takers, everyone)
         path = field_path(field, kind) if field and kind else ()
@@ -160,13 +176,14 @@ def hz(
     for_s: ForS = 0.0,
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """Measure a topic's rate, once per second. Example: companion topic hz sensors/imu --for-s 5
 
     Exit code 1: no message came in the time; 2: no such topic; 3: no bus.
     """
-    with Desk(bus) as desk:
+    with Desk(bus, certs=certs) as desk:
         view, _ = _found(desk, name, vehicle)
         _measure(desk, view, _named(view), RateMeter(window), Limits(count, for_s), as_json_=as_json_)
 
@@ -178,13 +195,14 @@ def bw(
     for_s: ForS = 0.0,
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """Measure a topic's bytes per second, once per second. Example: companion topic bw sensors/lidar --for-s 5
 
     Exit code 1: no message came in the time; 2: no such topic; 3: no bus.
     """
-    with Desk(bus) as desk:
+    with Desk(bus, certs=certs) as desk:
         view, _ = _found(desk, name, vehicle)
         _measure(desk, view, _named(view), BandwidthMeter(window), Limits(count, for_s), as_json_=as_json_)
 
@@ -196,13 +214,14 @@ def delay(
     for_s: ForS = 0.0,
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
 ) -> None:
     """Measure how old messages are when they come. Example: companion topic delay estimation/odometry --for-s 5
 
     Exit code 1: no message, or no stamps in it; 2: no such topic; 3: no bus.
     """
-    with Desk(bus) as desk:
+    with Desk(bus, certs=certs) as desk:
         view, everyone = _found(desk, name, vehicle)
         kind = message_type(desk, view.givers or view.takers, everyone)
         meter = DelayMeter(kind.decode, window)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.bus_options import BUS, VEHICLE, Bus, ForS, Json, Vehicle, say, stopping
+from companion.cli.bus_options import BUS, VEHICLE, Bus, Certs, ForS, Json, Vehicle, say, stopping
 from companion.runtime.tools.desk import Desk
 from companion.runtime.tools.ear import Limits
 from companion.runtime.tools.publish import await_subscriptions, publish, qos, topic_to_publish, type_to_publish
@@ -33,6 +33,7 @@ def pub(
     depth: Annotated[int, typer.Option("--qos-depth", min=1, help="Kept for late joiners, if transient_local.")] = 10,
     vehicle: Vehicle = VEHICLE,
     bus: Bus = BUS,
+    certs: Certs = None,
     as_json_: Json = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
@@ -42,7 +43,7 @@ def pub(
     Exit code 2: no such type or field; 3: nobody listens, or no bus.
     """
     values_ = parse_values(values)
-    with Desk(bus) as desk, stopping() as stopped:
+    with Desk(bus, certs=certs) as desk, stopping() as stopped:
         everyone = desk.entities()
         topic = topic_to_publish(everyone, name, vehicle)
         kind = type_to_publish(desk, everyone, topic, short_name(type_, "msg"))

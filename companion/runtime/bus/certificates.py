@@ -29,7 +29,6 @@ AUTHORITY_DAYS, CERTIFICATE_DAYS, MOST_DAYS = 3650, 365, 36500
 SKEW = timedelta(hours=1)  # clocks differ
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _HOST = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?<!-)(\.(?!-)[A-Za-z0-9-]{1,63}(?<!-))*")
-_EXISTS = "exists already; --force replaces it, and then {what} made with it {verb} no longer trusted"
 
 
 def make_authority(folder: Path, *, now: datetime, days: int = AUTHORITY_DAYS, force: bool = False) -> Path:
@@ -193,10 +192,10 @@ def _write_pair(
 
     pem = key.private_bytes(form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption())
     paths = folder / f"{name}.key", folder / f"{name}.crt"
-    what, verb = ("all certificates", "are") if name == AUTHORITY else ("the machine that uses it", "is")
+    lost = ", and then all certificates made with it are worthless" if name == AUTHORITY else ""
     for path in paths:
         if path.exists() and not force:
-            raise InputError(_EXISTS.format(what=what, verb=verb), file=str(path))
+            raise InputError(f"exists already; --force replaces it{lost}", file=str(path))
     _write(paths[0], pem, 0o600)
     _write(paths[1], certificate.public_bytes(form.Encoding.PEM), 0o644)
     return paths[1]

@@ -74,12 +74,21 @@ def open_ground(settings: GroundSettings, *, bus: str, vehicle: str) -> zenoh.Se
 
     Raises InputError for settings that make no sense, LinkError if the endpoint is taken or the bus away.
     """
+    config = ground_config(settings, bus=bus, vehicle=vehicle)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise LinkError(f"no ground link on {settings.endpoint}: {str(error).split(' at /')[0]}") from error
+
+
+def ground_config(settings: GroundSettings, *, bus: str, vehicle: str) -> zenoh.Config:
+    """What `open_ground` opens; raises InputError for settings that make no sense."""
     if not _ENDPOINT.fullmatch(settings.endpoint):
         raise InputError(f"{settings.endpoint!r} is no endpoint", field="--ground", valid="tls/HOST:PORT")
     inner = bus.partition("/")[0]
     if inner == "tls":
         raise InputError("the bus itself cannot be over TLS beside a ground link", field="--bus", valid="tcp/HOST:PORT")
-    config = configured(
+    return configured(
         COMMON
         | {
             "mode": "router",
@@ -100,10 +109,6 @@ def open_ground(settings: GroundSettings, *, bus: str, vehicle: str) -> zenoh.Se
             "low_pass_filter": [_small_questions()],
         }
     )
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise LinkError(f"no ground link on {settings.endpoint}: {str(error).split(' at /')[0]}") from error
 
 
 def access_control(

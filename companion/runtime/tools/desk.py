@@ -8,9 +8,11 @@ with Desk(endpoint) as desk:
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from types import TracebackType
 
 from companion.core.errors import InputError
+from companion.runtime.bus.certificate_files import find_credentials
 from companion.runtime.bus.directory import Directory
 from companion.runtime.bus.graph import Graph, GraphNode
 from companion.runtime.bus.session import ENDPOINT, open_session
@@ -21,12 +23,16 @@ HIDDEN = "_companion_cli"  # as ros2's own tools hide: by the underscore
 
 
 class Desk:
-    """Raises LinkError if no bus is there; everything ends with the `with` block."""
+    """Raises LinkError if no bus is there; everything ends with the `with` block.
 
-    def __init__(self, endpoint: str = ENDPOINT, *, domain: int = 0) -> None:
+    A ground link (`tls/HOST:PORT`) wants `certs`: a folder of certificates, or DIR/NAME.
+    """
+
+    def __init__(self, endpoint: str = ENDPOINT, *, domain: int = 0, certs: Path | None = None) -> None:
         if "/" not in endpoint or ":" not in endpoint:
             raise InputError(f"{endpoint!r} is no Zenoh endpoint", field="--bus", valid="tcp/HOST:PORT, tls/HOST:PORT")
-        self.session = open_session("client", endpoint=endpoint)
+        credentials = find_credentials(certs) if certs is not None else None
+        self.session = open_session("client", endpoint=endpoint, credentials=credentials)
         self.graph = Graph(self.session, domain=domain)
         self.node: GraphNode = self.graph.node(f"{HIDDEN}_{os.getpid()}")
         self.clock = Clock.of_host()
