@@ -34,6 +34,16 @@ GROUPS = {  # group -> help, command -> module and function
         "Make and check keys: of MAVLink signing, and of the ground link.",
         {"new": "keys:new", "ca": "keys:ca", "cert": "keys:cert", "show": "keys:show"},
     ),
+    "param": (
+        "See and set the autopilot's parameters; needs MAVSDK.",
+        {
+            "get": "param:get",
+            "set": "param:set_",
+            "list": "param:list_parameters",
+            "save": "param:save",
+            "load": "param:load",
+        },
+    ),
     "mavlink": ("Look into MAVLink logs.", {"inspect": "mavlink:inspect"}),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",

@@ -63,6 +63,10 @@ class Sim:
         until(lambda: self._process.poll() is not None or any("ready" in s for s in self.said), "ready", START_S)
         assert self._process.poll() is None, self.said
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
     def end(self, number: int = signal.SIGINT) -> dict[str, object]:
         self._process.send_signal(number)
         out = self._process.stdout.read()
