@@ -171,5 +171,5 @@ def _show_differences(found: list[Difference], *, as_json: bool) -> None:
 
 
 def _json(name: str, value: Value, **more: Value) -> str:
-    kind = "int32" if isinstance(value, int) else "float32"
+    kind = "int" if isinstance(value, int) else "float"
     return msgspec.json.encode({"name": name, "value": value, "type": kind, **more}).decode()
