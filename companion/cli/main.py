@@ -45,6 +45,7 @@ GROUPS = {  # group -> help, command -> module and function
         },
     ),
     "mavlink": ("Look into MAVLink logs.", {"inspect": "mavlink:inspect"}),
+    "bench": ("Measure this machine.", {"bus": "bench:bus"}),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",
         {

@@ -46,7 +46,14 @@ class BusOutlet:
     A topic of several nodes is declared by the first.
     """
 
-    def __init__(self, graph: Graph, published: Mapping[str, Sequence[Topic[Any]]], *, vehicle: str) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        published: Mapping[str, Sequence[Topic[Any]]],
+        *,
+        vehicle: str,
+        urgency: Mapping[Service, Urgency] = URGENCY,
+    ) -> None:
         self._publishers: dict[str, Publisher] = {}
         self.sent: Counter[str] = Counter()
         self.sent_bytes = 0
@@ -55,7 +62,7 @@ class BusOutlet:
             for topic in topics_of_node:
                 if topic.name not in self._publishers and topic not in LINK_ONLY:
                     self._publishers[topic.name] = entity.publisher(
-                        bus_name(topic, vehicle), codec_of(topic).type, qos_of(topic), URGENCY[topic.service]
+                        bus_name(topic, vehicle), codec_of(topic).type, qos_of(topic), urgency[topic.service]
                     )
 
     def publish(self, topic: Topic[Any], message: Any, now_ns: int) -> None:

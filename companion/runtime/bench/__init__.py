@@ -1,0 +1,1 @@
+"""Measurements of the running stack's parts, for `companion bench`."""
