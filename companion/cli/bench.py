@@ -41,7 +41,8 @@ def bus(
 
 
 def _table(rows: list[BusRow]) -> Table:
-    table = Table(title=f"Bus at full load, {rows[0].for_s:g} s each; setpoints end to end")
+    how = "" if rows[0].ran_first else "; not allowed to run before other processes, so late by those, too"
+    table = Table(title=f"Bus at full load, {rows[0].for_s:g} s each; setpoints end to end{how}")
     for name in COLUMNS:
         table.add_column(name, justify="left" if name == "way" else "right")
     for r in rows:

@@ -46,6 +46,8 @@ class BusRow(msgspec.Struct, frozen=True, kw_only=True):
     mb_per_s: float
     sent: dict[str, int]
     lost: dict[str, int]
+    ran_first: bool
+    """Both sides ran before ordinary processes, as control does where the system allows it."""
     machine_load: float
     """Runnable processes on the machine in the minute before, of `cores`."""
     cores: int
@@ -119,6 +121,7 @@ def _row(way: Way, for_s: float, sent: Tally, heard: Tally, load: float) -> BusR
         mb_per_s=round(heard.payload_bytes / for_s / 1e6, 2),
         sent={name: sent.messages.get(name, 0) for name in order},
         lost={name: sent.messages.get(name, 0) - heard.messages.get(name, 0) for name in order},
+        ran_first=sent.ran_first and heard.ran_first,
         machine_load=round(load, 2),
         cores=os.cpu_count() or 1,
     )

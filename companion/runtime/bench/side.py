@@ -25,6 +25,7 @@ from companion.runtime.bus.attach import URGENCY, BusOutlet, Hearing
 from companion.runtime.bus.graph import Graph, Urgency
 from companion.runtime.bus.session import configured, open_session
 from companion.runtime.clock import Clock
+from companion.runtime.priority import run_first
 from companion.runtime.wire import codec_of
 
 Way = Literal["classes", "defaults", "raw bytes"]
@@ -50,6 +51,8 @@ class Tally(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: float
     messages: dict[str, int]
     payload_bytes: int = 0
+    ran_first: bool = False
+    """Before ordinary processes."""
     latency_ms: list[float] = []
     """Of each setpoint, from before it is encoded until it is decoded."""
     gap_ms: list[float] = []
@@ -59,11 +62,13 @@ class Tally(msgspec.Struct, frozen=True, kw_only=True):
 def main() -> None:
     """Do what the first line of standard input says."""
     part = msgspec.json.decode(sys.stdin.readline(), type=Part)
+    first = run_first()  # as control does: others on this machine shall not be what is measured
     with ExitStack() as stack:
         side = _sender(part, stack) if part.side == "send" else _receiver(part, stack)
         print("ready", flush=True)
         begin_ns = int(sys.stdin.readline())
         tally = side(begin_ns)
+    tally = msgspec.structs.replace(tally, ran_first=first)
     print(msgspec.json.encode(tally).decode(), flush=True)
 
 
