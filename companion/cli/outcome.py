@@ -6,10 +6,9 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -17,12 +16,12 @@ from rich.table import Table
 from companion.cli.simulation import Simulator, scenery_of
 from companion.config import dump_config
 from companion.core.node import Node
-from companion.mapping.node import MappingNode
 from companion.report.flight_figure import draw_flight, headline
 from companion.report.summary import Summary, to_json, trajectory_figures
 from companion.report.tracks import Tracks
 from companion.runtime.flight import Flight
 from companion.runtime.flight_log import FlightLog
+from companion.runtime.map_file import save_map
 
 if TYPE_CHECKING:
     from companion.cli.fly import Request
@@ -55,7 +54,7 @@ def write_outcome(
     (out / "config.yaml").write_text(dump_config(request.config), encoding="utf-8")
     (out / "simulator.yaml").write_text(sim.describe(), encoding="utf-8")
     _write_why(out / "why.log", tracks)
-    _write_map(out / "map.npz", stack)
+    save_map(out / "map.npz", stack)
     picture = out / "flight.png"
     title = headline(summary.mission, summary.world, summary.seed, summary.reason, msgspec.structs.asdict(summary))
     draw_flight(picture, tracks, scenery_of(sim.world), title)
@@ -90,13 +89,6 @@ def _summary(
 def _write_why(path: Path, tracks: Tracks) -> None:
     lines = [f"{w.stamp_ns * 1e-9:9.3f} s  {w.node}: {w.what}, because {w.because}\n" for w in tracks.why]
     path.write_text("".join(lines), encoding="utf-8")
-
-
-def _write_map(path: Path, stack: Sequence[Node]) -> None:
-    for node in stack:
-        if isinstance(node, MappingNode):
-            arrays: dict[str, Any] = {**node.voxels.to_arrays()}
-            np.savez_compressed(path, **arrays)
 
 
 def print_outcome(outcome: Outcome, console: Console, *, as_json: bool) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from companion.cli.children import beside
 from companion.cli.run import RunRequest, fly_live
 from companion.cli.simulation import scenery_of
 from companion.core.errors import LinkError
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from companion.cli.fly import Request
 
 VEHICLE = "drone1"
-STOP_S = 10.0
 
 
 def fly_realtime(request: Request, console: Console) -> LiveSummary:
@@ -48,40 +46,25 @@ def _run_request(request: Request, port: int) -> RunRequest:
         seed=request.seed,
         out=request.out,
         log=True,
+        record=request.record,
     )
 
 
 @contextmanager
 def _simulator(request: Request, port: int) -> Iterator[None]:
     """`companion sim` as a child; its summary goes to `simulator.json`, its words to `simulator.log`."""
-    command = [sys.executable, "-m", "companion", "sim", "--world", request.world, "--seed", str(request.seed)]
-    command += ["--mavlink", f"udp://127.0.0.1:{port}", "--name", VEHICLE, "--json"]
+    command = ["sim", "--world", request.world, "--seed", str(request.seed), "--name", VEHICLE, "--json"]
+    command += ["--mavlink", f"udp://127.0.0.1:{port}"]
     for override in request.overrides:
         if override.startswith("sim."):
             command += ["--set", override]
-    with (
-        (request.out / "simulator.json").open("wb") as summary,
-        (request.out / "simulator.log").open("wb") as words,
-        subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=summary, stderr=words, start_new_session=True
-        ) as sim,
-    ):
-        try:
-            yield
-        finally:
-            early = sim.poll()
-            _end(sim)
+    words = request.out / "simulator.log"
+    with beside(command, out=request.out / "simulator.json", words=words) as sim:
+        yield
+        early = sim.poll()
     if early:
-        text = (request.out / "simulator.log").read_text(errors="replace").strip()
+        text = words.read_text(errors="replace").strip()
         raise LinkError(f"the simulator ended with code {early}: {text.splitlines()[-1] if text else 'no word'}")
-
-
-def _end(sim: subprocess.Popen[bytes]) -> None:
-    sim.terminate()
-    try:
-        sim.wait(STOP_S)
-    except subprocess.TimeoutExpired:
-        sim.kill()
 
 
 def _free_port() -> int:

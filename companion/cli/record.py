@@ -24,7 +24,7 @@ def record(
         list[str] | None,
         typer.Argument(help="Topics, also with *: sensors/*; without any: all but hidden ones and whole local maps."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File to write [<time>.mcap].")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write [<time>.mcap].")] = None,
     split_mb: Annotated[int, typer.Option(min=0, help="Begin a new file beyond this size; 0: never.")] = 0,
     split_s: Annotated[float, typer.Option(min=0, help="Begin a new file after this time; 0: never.")] = 0.0,
     for_s: ForS = 0.0,

@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.status import Status
 
+from companion.cli.children import recorder
 from companion.cli.flight_input import read_text, stack_config
 from companion.cli.ground_options import Allowed, Certificates, Rates, ground_settings
 from companion.cli.live_outcome import print_live, write_live
@@ -55,6 +56,7 @@ class RunRequest:
     seed: int
     out: Path
     log: bool
+    record: bool = False
     key_file: str = ""
     ground: GroundSettings | None = None
 
@@ -78,6 +80,7 @@ def run(
     ground_rate: Rates = None,
     ground_allow: Allowed = None,
     log: Annotated[bool, typer.Option(help="Write what `companion replay` needs.")] = True,
+    record: Annotated[bool, typer.Option(help="Record the bus into flight.mcap, too.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
@@ -98,6 +101,7 @@ def run(
         seed=seed,
         out=out or Path("flights") / f"{datetime.now():%Y-%m-%d-%H%M%S}-{parsed.name}",
         log=log,
+        record=record,
         key_file=str(key.resolve()) if key else "",
         ground=ground_settings(ground, ground_certs, ground_rate or (), ground_allow or (), bus=bus, vehicle=name),
     )
@@ -131,6 +135,8 @@ def fly_live(request: RunRequest, console: Console) -> tuple[LiveSummary, Tracks
             airborne=lambda: monitor.airborne,
         )
         reports = Reports(graph, clock=clock, vehicle=request.vehicle)
+        if request.record:
+            stack.enter_context(recorder(request.out, request.bus))
         lost = _fly(supervisor, monitor, tracks, reports, console)
         return write_live(request, supervisor, monitor, tracks, lost), tracks
 

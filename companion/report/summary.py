@@ -68,6 +68,21 @@ def trajectory_figures(tracks: Tracks) -> dict[str, float]:
     }
 
 
+def estimated_figures(tracks: Tracks) -> dict[str, float]:
+    """Length and speed as the stack itself saw them: where no simulator tells the truth."""
+    if len(tracks.odometry) < 2:
+        return dict.fromkeys(_FIGURES, float("nan"))
+    estimate = tracks.estimated_track()
+    speed = np.linalg.norm([m.v_odom for m in tracks.odometry], axis=1)
+    moving = speed[speed > MOVING_M_S]
+    return dict.fromkeys(_FIGURES, float("nan")) | {
+        "path_length_m": path_length(estimate.p),
+        "mean_speed_m_s": float(moving.mean()) if len(moving) else 0.0,
+        "max_speed_m_s": float(speed.max()),
+        "duration_s": float(estimate.t_s[-1]),
+    }
+
+
 def path_length(p: Array) -> float:
     """Length of a polyline (N, 3) without standing noise: steps shorter than 5 cm are joined."""
     total, anchor = 0.0, p[0]
