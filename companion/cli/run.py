@@ -32,6 +32,7 @@ from companion.runtime.bus.graph import Graph
 from companion.runtime.bus.ground import GroundSettings, open_ground
 from companion.runtime.bus.reports import Reports
 from companion.runtime.bus.session import ENDPOINT, open_session
+from companion.runtime.bus.simulated_clock import join_clock
 from companion.runtime.clock import Clock
 from companion.runtime.monitor import WATCHED, Monitor
 from companion.runtime.pipes import Assignment
@@ -56,6 +57,7 @@ class RunRequest:
     seed: int
     out: Path
     log: bool
+    speed: float = 1.0
     record: bool = False
     key_file: str = ""
     ground: GroundSettings | None = None
@@ -72,6 +74,7 @@ def run(
     name: Annotated[str, typer.Option(help="Name of the vehicle on the bus.")] = "drone1",
     bus: Annotated[str, typer.Option(help="Zenoh endpoint of the bus.")] = ENDPOINT,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the planner.")] = 0,
+    speed: Annotated[float, typer.Option(min=0.05, max=20, help="That of `companion sim`, if not real time.")] = 1.0,
     key: Annotated[Path | None, typer.Option(help="Key file that signs MAVLink; see `companion keys`.")] = None,
     ground: Annotated[
         str, typer.Option(help="Telemetry for ground stations on tls/HOST:PORT, such as tls/0.0.0.0:7448.")
@@ -100,6 +103,7 @@ def run(
         bus=bus,
         seed=seed,
         out=out or Path("flights") / f"{datetime.now():%Y-%m-%d-%H%M%S}-{parsed.name}",
+        speed=speed,
         log=log,
         record=record,
         key_file=str(key.resolve()) if key else "",
@@ -117,11 +121,11 @@ def run(
 def fly_live(request: RunRequest, console: Console) -> tuple[LiveSummary, Tracks]:
     """Fly it, write everything into `request.out`, return what came out and what was seen."""
     request.out.mkdir(parents=True, exist_ok=True)
-    clock = Clock.of_host()
     with ExitStack() as stack:
         session = stack.enter_context(open_session("first", endpoint=request.bus))
         graph = stack.enter_context(Graph(session))
         _refuse_a_second(Directory(graph), request)
+        clock = join_clock(graph, Clock.of_host(), speed=request.speed)
         if request.ground:
             stack.enter_context(open_ground(request.ground, bus=request.bus, vehicle=request.vehicle))
         tracks = Tracks()
@@ -231,6 +235,8 @@ def _assignments(request: RunRequest, clock: Clock) -> list[Assignment]:
             vehicle=request.vehicle,
             bus=request.bus,
             clock_offset_ns=clock.offset_ns,
+            clock_speed=clock.speed,
+            clock_since_ns=clock.since_ns,
             out=str(request.out),
             link=request.link if group == "control" else "",
             key_file=request.key_file if group == "control" else "",

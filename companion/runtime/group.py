@@ -75,7 +75,8 @@ class Process:
 
     def __init__(self, assignment: Assignment, words: Iterator[bytes], up: BinaryIO, stack: ExitStack) -> None:
         self._assignment, self._words, self._up = assignment, words, up
-        self._clock = Clock(assignment.clock_offset_ns)
+        a = assignment
+        self._clock = Clock(a.clock_offset_ns, a.clock_speed, a.clock_since_ns)
         self._go, self._stop = threading.Event(), threading.Event()
         self._group: LiveGroup | None = None
         self._latency, self._watch = Latency(), Monitor()

@@ -149,7 +149,7 @@ class Crew:
                     busy = seat.handle_next() or busy
                 if not busy:
                     due_ns = min(seat.due_ns for seat in self.seats)
-                    self._bell.wait(min((due_ns - self._group.clock.now_ns()) * 1e-9, IDLE_S))
+                    self._bell.wait(min(self._group.clock.wait_s(due_ns), IDLE_S))
         except BaseException as error:
             self._group.fail(seat.name, error)
 

@@ -23,6 +23,8 @@ class Assignment(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     vehicle: str  # name on the bus
     bus: str  # endpoint of the router
     clock_offset_ns: int
+    clock_speed: float = 1.0
+    clock_since_ns: int = 0
     out: str  # folder of the flight
     link: str = ""  # MAVLink URL; for the group that flies
     key_file: str = ""  # signs the link

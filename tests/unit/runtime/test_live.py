@@ -8,6 +8,7 @@ import pytest
 from companion.core.errors import InputError
 from companion.core.messages import BaroReading, RangeReading
 from companion.core.node import Node, Outputs, Topic, every, on
+from companion.runtime.bus.simulated_clock import set_by
 from companion.runtime.clock import Clock
 from companion.runtime.live import LiveGroup
 from companion.runtime.mailbox import Bell, Mailbox, Parcel
@@ -219,3 +220,16 @@ def test_the_clock_never_steps_back():
     stamps = [clock.now_ns() for _ in range(1000)]
     assert stamps == sorted(stamps)
     assert abs(stamps[-1] - time.time_ns()) < 5_000_000_000
+
+
+@pytest.mark.parametrize("speed", [0.25, 0.5, 3.0])
+def test_a_clock_set_by_a_simulators_shows_the_same_time_however_late_its_word_came(speed):
+    now_ns = 1_800_000_000_000_000_000
+    truth = Clock(0, speed, now_ns - 7_000_000_000)
+    late_ns = (4_000_000, 200_000, 30_000_000, 1_000_000)
+    sent_ns = [now_ns + k * 20_000_000 for k in range(4)]
+    heard = [(sent + late, truth.shown_ns(sent)) for sent, late in zip(sent_ns, late_ns, strict=True)]
+    clock = set_by(heard, Clock(0), speed=speed)
+    error_ns = clock.shown_ns(now_ns) - truth.shown_ns(now_ns)
+    assert -200_000 * max(speed, 1) - 1000 <= error_ns <= 0  # the least late word counts
+    assert clock.shown_ns(now_ns + 10**9) - clock.shown_ns(now_ns) == pytest.approx(speed * 1e9)
