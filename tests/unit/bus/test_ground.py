@@ -24,6 +24,9 @@ from companion.runtime.bus.ground import GroundSettings, access_control, downsam
 from companion.runtime.bus.session import configured, open_session, tls_trust
 from companion.runtime.clock import Clock
 from companion.runtime.ports.endpoint import parse_endpoint
+from companion.runtime.tools.desk import Desk
+from companion.runtime.tools.ear import listen
+from companion.runtime.tools.names import topics_of
 from companion.runtime.vehicle_link import VehicleLink
 from companion.runtime.wire import codec_of, service_type, wire_type
 from companion.runtime.wire.keys import Qos, topic_key
@@ -172,7 +175,7 @@ def test_nothing_that_a_station_says_reaches_a_subscriber_on_the_bus(mode, groun
     everything = inside[1].session.declare_subscriber("0/**", lambda s: heard.append(s.payload.to_bytes()))
     aside = inside[1].session.declare_subscriber("**", lambda s: heard.append(s.payload.to_bytes()))
     with everything, aside, as_mode(mode, ground, certs[0]) as stranger:
-        keys = [*map(key, SHUT), "0/v/mavlink/tx/a/b", "0/w/else/a/b", "0/tf/a/b", "other"]
+        keys = [*map(key, SHUT), "0/v/mavlink/tx/a/b", "0/w/else/a/b", "0/tf/a/b", "other", "0/**", "**", "0/v/note/**"]
         for put_key in keys:
             stranger.declare_publisher(put_key).put(b"evil")
         for _ in range(10):
@@ -185,6 +188,27 @@ def test_nothing_that_a_station_says_reaches_a_subscriber_on_the_bus(mode, groun
         zids = [str(z) for z in inside[1].session.info.peers_zid()]
         assert str(stranger.zid()) not in zids  # no link past the ground link
     assert set(heard) == {b"the bus works"}
+
+
+def test_one_session_with_both_endpoints_would_let_a_peer_in(endpoint, certs, eventually):
+    """Why the ground link is a session of its own: the nodes dial a peer that their router tells them of."""
+    outside, pair = f"tls/127.0.0.1:{free_port()}", find_credentials(certs[0] / "drone1")
+    both = {
+        "mode": "router",
+        "listen/endpoints": [endpoint, outside],
+        "scouting/multicast/enabled": False,
+        "transport/link/tls": tls_trust(pair)
+        | {"listen_certificate": str(pair.certificate), "listen_private_key": str(pair.key)},
+        "access_control": access_control("v", "tcp"),
+    }
+    heard = []
+    with (
+        zenoh.open(configured(both)),
+        open_session("peer", endpoint=endpoint) as node,
+        node.declare_subscriber(key(topics.GOAL), heard.append),
+        as_mode("peer", outside, certs[0]) as stranger,
+    ):
+        eventually(lambda: stranger.put(key(topics.GOAL), b"evil") or heard)
 
 
 @pytest.mark.parametrize("mode", ["client", "peer", "router"])
@@ -204,6 +228,15 @@ def test_a_station_serves_nothing_names_nothing_and_calls_nothing(mode, ground, 
         assert inside[1].node("n").call("/v/other", trigger, asked, stamp_ns=1, timeout_s=0.5) is None
         assert not {"impostor", "caller"} & {e.node for e in Directory(inside[1]).nodes()}
     assert served == []
+
+
+def test_topic_tools_sit_on_the_ground_as_on_the_bus(inside, ground, certs, eventually):
+    outlet = BusOutlet(inside[0], {"Source": [topics.RANGE]}, vehicle="v")
+    with Desk(ground, certs=certs[0] / "laptop") as desk:
+        (view,) = eventually(lambda: [t for t in topics_of(desk.entities()) if t.name == "/v/sensors/range"])
+        ear = listen(desk, view, codec_of(topics.RANGE).type)
+        heard = eventually(lambda: outlet.publish(topics.RANGE, reading(7), 7) or ear.take(0.1))
+    assert codec_of(topics.RANGE).decode(heard.payload).range_m == 7.0
 
 
 def test_a_topic_that_is_allowed_comes_through(inside, station, eventually):
@@ -227,6 +260,18 @@ def test_without_a_good_certificate_nobody_gets_in(who, ground, certs):
             trusting = pair._replace(authority=(ours / "ca.crt"))  # it believes us; do we believe it?
             open_session("client", endpoint=ground, credentials=trusting).close()
     assert time.monotonic() - began_s < 10  # it ends
+
+
+def test_a_station_is_cut_off_when_its_certificate_expires(inside, ground, certs, eventually):
+    soon = datetime.now(UTC) + timedelta(seconds=3) - timedelta(days=1)
+    make_certificate(certs[0], "brief", now=soon, days=1, force=True)
+    outlet, box = BusOutlet(inside[0], {"Source": [topics.MAP_STATUS]}, vehicle="v"), Box()
+    status = m.MapStatus(stamp_ns=1, scans=1, blocks=1)
+    credentials = find_credentials(certs[0] / "brief")
+    with open_session("client", endpoint=ground, credentials=credentials) as opened, Graph(opened) as graph:
+        Hearing(graph, [topics.MAP_STATUS], box, listener="brief", vehicle="v")
+        eventually(lambda: outlet.publish(topics.MAP_STATUS, status, 0) or box.got)
+        eventually(lambda: not [*opened.info.routers_zid()])
 
 
 def nobody(endpoint, folder):
