@@ -48,6 +48,8 @@ _TIMESYNC: Final = 111
 _ONBOARD_CONTROLLER: Final = 18  # MAV_TYPE
 _ACTIVE: Final = 4  # MAV_STATE
 _REJECTED_EVERY_TICKS: Final = 100
+_WANTS_A_KEY: Final = "the autopilot signs its messages: it may want ours signed, with its key"
+_ANOTHER_KEY: Final = "frames come, but without a signature of our key: both sides need the same key file"
 _WANTED: Final = (*Id, _COMMAND_ACK, _TIMESYNC)
 
 
@@ -265,8 +267,7 @@ class AutopilotNode(Node):
     def _explained(self, verdict: Verdict) -> Verdict:
         if self._signing is not None or not self._parser.signed:
             return verdict
-        hint = "the autopilot signs its messages: it may want ours signed, with its key"
-        return verdict._replace(reason=f"{verdict.reason}; {hint}")
+        return verdict._replace(reason=f"{verdict.reason}; {_WANTS_A_KEY}")
 
     def _interval_request(self, msg_id: int, hz: float) -> codec.CommandLong:
         system, component = self._target
@@ -283,7 +284,17 @@ class AutopilotNode(Node):
             status = replace(status, ready=False)
         if self._neighbours.present(now_ns):
             status = replace(status, ready=False, text=self._neighbours.reason)
+        elif not status.connected:
+            status = replace(status, text=self._key_trouble(ready=False, connected=False))  # its old words are stale
+        elif trouble := self._key_trouble(ready=status.ready, connected=True):
+            status = replace(status, text=f"{status.text}; {trouble}" if status.text else trouble)
         return VEHICLE(status)
+
+    def _key_trouble(self, *, ready: bool, connected: bool) -> str:
+        """Why a vehicle that is there does not count, or does not hear us; '' if keys cannot be the reason."""
+        if self._signing is None:
+            return _WANTS_A_KEY if self._parser.signed and connected and not ready else ""
+        return _ANOTHER_KEY if self._signing.rejected.total and not connected else ""
 
     def _tell(self, news: News | None, now_ns: int) -> Outputs:
         """A text to the pilot, if the autopilot is there to pass it on."""

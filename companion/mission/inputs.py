@@ -22,7 +22,7 @@ def missing(inputs: Inputs, now_ns: int, *, fresh_s: float) -> str:
     """What a start still waits for; '' if nothing."""
     odometry, vehicle, safety = inputs.odometry, inputs.vehicle, inputs.safety
     if vehicle is None or not vehicle.connected:
-        return "no vehicle"
+        return _because("no vehicle", vehicle)
     if odometry is None or now_ns - odometry.stamp_ns > fresh_s * 1e9:
         return "no odometry"
     if not vehicle.landed:
@@ -30,10 +30,14 @@ def missing(inputs: Inputs, now_ns: int, *, fresh_s: float) -> str:
     if vehicle.armed:
         return f"armed by somebody else, in mode {vehicle.mode}"
     if not vehicle.ready:
-        return f"the autopilot is not ready: {vehicle.text}"
+        return _because("the autopilot is not ready", vehicle)
     if safety is not None and safety.action in ("hold", "land"):
         return safety.reason
     return ""
+
+
+def _because(what: str, vehicle: VehicleStatus | None) -> str:
+    return f"{what}: {vehicle.text}" if vehicle is not None and vehicle.text else what
 
 
 def taken_over(vehicle: VehicleStatus | None, ours: tuple[str, ...], *, may_disarm: bool) -> str:

@@ -64,7 +64,7 @@ class Flight:
         self.line.__enter__()
         self.sim = self.start_sim("sim")
         self.run = self.start_run("run")
-        self._session = open_session("client", endpoint=self.bus)
+        self._session = open_session("peer", endpoint=self.bus)  # lives on without the simulator, its router
         self._graph = Graph(self._session)
         Hearing(self._graph, WATCHED, self.monitor, listener="test", vehicle="drone1")
         return self

@@ -95,11 +95,6 @@ def faults():
 
 
 @pytest.fixture(scope="session")
-def root():
-    return flying.ROOT
-
-
-@pytest.fixture(scope="session")
 def wishes():
     """(monotonic s, what) of every arming and mode that went to the vehicle."""
 

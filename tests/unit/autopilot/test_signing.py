@@ -142,3 +142,28 @@ def test_the_node_signs_everything_and_hears_only_the_key():
     early, late = (w.because for w in flight.published(WHY) if "signature" in w.what)
     assert early == "1 unsigned, 1 of another key or altered, 0 replayed or too old so far"
     assert late == "1 unsigned, 1 of another key or altered, 1 replayed or too old so far"
+
+
+def status_after(flight, *frames, now_ns=NOW):
+    for data in frames:
+        flight.feed(MAVLINK_RX, MavlinkBytes(stamp_ns=now_ns, data=data))
+    return flight.tick(now_ns + 100 * MS).status
+
+
+def test_the_status_says_that_keys_keep_both_sides_apart():
+    other = status_after(Flight(key=KEY), frame(theirs(OTHER)))
+    assert not other.connected and "both sides need the same key file" in other.text
+    unsigned = status_after(Flight(key=KEY), frame(dialect.MAVLink(None, srcSystem=1, srcComponent=1)))
+    assert not unsigned.connected and "both sides need the same key file" in unsigned.text
+    without = status_after(Flight(), frame(theirs()))
+    assert without.connected and not without.ready and "it may want ours signed" in without.text
+    same = status_after(Flight(key=KEY), frame(theirs()))
+    assert same.connected and same.text == ""
+
+
+def test_what_a_silent_vehicle_said_is_not_repeated():
+    flight = Flight()
+    said = dialect.MAVLink_statustext_message(6, b"Takeoff detected")
+    assert status_after(flight, *(frame(theirs(), m) for m in (heartbeat(), said))).text.startswith("Takeoff detected")
+    assert status_after(flight, now_ns=NOW + 10 * S).connected is False
+    assert flight.status.text == ""
