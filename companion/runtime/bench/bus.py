@@ -10,6 +10,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from typing import Literal, get_args
@@ -25,6 +26,7 @@ from companion.runtime.clock import Clock
 
 WAYS: tuple[Way, ...] = get_args(Way)
 WARM_S = 1.5  # sends before it counts
+START_S = 60.0  # a side that is not there then, and done in time, is killed
 
 
 class BusRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,6 +86,9 @@ def _start(
     command = [sys.executable, "-m", "companion.runtime.bench.side"]
     process = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
     stack.callback(process.kill)
+    watchdog = threading.Timer(START_S + WARM_S + for_s, process.kill)
+    watchdog.start()
+    stack.callback(watchdog.cancel)
     part = Part(side=side, way=way, endpoint=endpoint, clock_offset_ns=clock.offset_ns, for_s=for_s)
     _say(process, msgspec.json.encode(part).decode())
     return process

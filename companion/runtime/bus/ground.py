@@ -21,7 +21,7 @@ import zenoh
 from companion.core import topics
 from companion.core.errors import InputError, LinkError
 from companion.runtime.bus.certificate_files import Credentials
-from companion.runtime.bus.session import COMMON, configured, tls_trust
+from companion.runtime.bus.session import COMMON, QUEUES, configured, tls_trust
 
 RATES_HZ = {  # most per second on the ground link; other topics pass whole
     "sensors/imu": 10.0,
@@ -45,6 +45,7 @@ SHARED = ("tf", "tf_static", "diagnostics", "rosout", "clock")  # what ROS keeps
 STATIONS = 16  # sessions at most
 QUERY_BYTES = 4096  # a question from the ground needs no more
 MESSAGE_BYTES = 64_000_000  # and no message is larger
+SOCKET_BYTES = 65_536  # unsent bytes that no urgent message can overtake: more is late on slow links, less loses clouds
 CONNECT_MS = 2000
 
 _TOKENS, _DOMAIN = "@ros2_lv/0/**", "0"
@@ -99,10 +100,13 @@ def ground_config(settings: GroundSettings, *, bus: str, vehicle: str) -> zenoh.
             "scouting/gossip/enabled": False,  # neither side learns where the other listens
             "transport/unicast/max_sessions": STATIONS + 1,
             "transport/link/rx/max_message_size": MESSAGE_BYTES,
+            "transport/link/tx/queue/size": QUEUES | {"data_low": 16},  # a cloud of 1 MB finds room at once
+            "transport/shared_memory/enabled": False,  # nobody outside maps this machine's memory
             "transport/link/tls": tls_trust(settings.credentials)
             | {
                 "listen_certificate": str(settings.credentials.certificate),
                 "listen_private_key": str(settings.credentials.key),
+                "so_sndbuf": SOCKET_BYTES,
             },
             "access_control": access_control(vehicle, inner, allowed=settings.allowed, rates_hz=settings.rates_hz),
             "downsampling": [downsampling(vehicle, RATES_HZ | settings.rates_hz)],
