@@ -42,6 +42,7 @@ from companion.runtime.supervisor import Supervisor
 from companion.stack import GROUPS
 
 LOOK_S = 0.02
+JOINING_LOOKS, JOINING_PAUSE_S = 5, 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,12 +217,15 @@ def _interrupts() -> Iterator[_Interrupts]:
 
 
 def _refuse_a_second(directory: Directory, request: RunRequest) -> None:
-    for node in directory.nodes():
-        if node.namespace == f"/{request.vehicle}" and node.node == "AutopilotNode":
-            raise LinkError(
-                f"another companion flies {request.vehicle} on the bus at {request.bus}: "
-                "end it first, or choose another --name and --vehicle"
-            )
+    """Look for more than a moment: a session that has just joined does not know everybody yet."""
+    for _ in range(JOINING_LOOKS):
+        for node in directory.nodes():
+            if node.namespace == f"/{request.vehicle}" and node.node == "AutopilotNode":
+                raise LinkError(
+                    f"another companion flies {request.vehicle} on the bus at {request.bus}: "
+                    "end it first, or choose another --name and --vehicle"
+                )
+        time.sleep(JOINING_PAUSE_S)
 
 
 def _assignments(request: RunRequest, clock: Clock) -> list[Assignment]:

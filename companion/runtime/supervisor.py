@@ -34,7 +34,11 @@ STOP_ORDER: Final = ("control", "world", "graph", "perception", "recorder")
 
 
 class GroupError(CompanionError):
-    """A group cannot run; its log says why."""
+    """A group cannot run; its log says why. A wrong input or a taken link there is one here."""
+
+    def __init__(self, what: str, group_code: int | None = None) -> None:
+        super().__init__(what)
+        self.exit_code = group_code if group_code in (2, 3) else 1
 
 
 @dataclass(slots=True)
@@ -120,7 +124,7 @@ class Supervisor:
         while any(child.state != "ready" for child in self.children):
             for child in self.children:
                 if child.state == "dead":
-                    raise GroupError(f"{child.name} could not start: {child.last_words()}")
+                    raise GroupError(f"{child.name} could not start: {child.last_words()}", child.exit_code)
             if time.monotonic() > until_s:
                 names = ", ".join(c.name for c in self.children if c.state != "ready")
                 raise GroupError(f"not ready after {READY_S:g} s: {names}")

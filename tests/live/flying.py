@@ -36,6 +36,14 @@ steps:
   - {do: goto, at: [10, 5, 2], limits: {speed: 1.0}}
   - {do: return_home, land: land}
 """
+HOVER = """
+version: 1
+name: hover
+steps:
+  - {do: takeoff, alt: 2.0}
+  - {do: hover, seconds: 300}
+  - {do: land}
+"""
 LIGHT = "sim.lidar.points=8000"  # what dies and what follows is not a matter of rays: leave room for the test
 START_S, FLIGHT_S = 240.0, 150.0
 
@@ -49,14 +57,14 @@ def free_port(kind):
 class Flight:
     """`companion sim` and `companion run` as processes; `monitor` hears the bus, `line` the MAVLink."""
 
-    def __init__(self, folder, *, world="demo", options=(), sim_options=("--gcs=",)):
+    def __init__(self, folder, *, world="demo", options=(), sim_options=("--gcs=",), mission=MISSION):
         self.out, self.folder = folder / "flight", folder
         self.bus = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.port = free_port(socket.SOCK_DGRAM)
         self.line = middleman.Middleman(towards=("127.0.0.1", self.port), seed=1)
         self.plan = None  # the newest PlanStatus
         self.monitor = Monitor([self])
-        (folder / "mission.yaml").write_text(MISSION)
+        (folder / "mission.yaml").write_text(mission)
         self._processes, self._world, self._options, self._sim_options = {}, world, options, sim_options
         self._session = self._graph = None
 

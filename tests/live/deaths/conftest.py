@@ -18,6 +18,13 @@ def flight(tmp_path):
         yield running
 
 
+@pytest.fixture
+def hover(tmp_path):
+    """A flight that stays long enough to be looked at."""
+    with flying.Flight(tmp_path, mission=flying.HOVER) as running:
+        yield running
+
+
 @pytest.fixture(scope="session", name="speed_of")
 def _speed_of():
     return flying.speed_of
