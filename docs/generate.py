@@ -1,8 +1,8 @@
 """Writes the generated pages of docs/: run `python docs/generate.py` after a change of the code.
 
 What flights gave comes from the folders of flights: `python docs/generate.py flights/demo flights/look flights/live`.
-Where README and docs say `<!-- table: MISSION -->` or `<!-- why: MISSION -->` (`<!-- table: live -->`) the block that follows is
-replaced; the first folder also gives docs/reference/performance.md. A test compares the other pages
+Where README and docs say `<!-- table: MISSION -->`, `<!-- table: live -->` or `<!-- why: MISSION -->` the block
+that follows is replaced; the first folder also gives docs/reference/performance.md. A test compares the other pages
 with the code.
 """
 
