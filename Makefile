@@ -24,13 +24,13 @@ slow: $(STAMP)
 bench: $(STAMP)
 	$(VENV)/bin/python -m pytest tests/bench -m "slow or not slow" --benchmark-only
 
-# MAVProxy and dronekit2 are clients in tests, without the second OpenCV and the VTK that MAVProxy's maps want.
+# MAVProxy is a client in tests, without the second OpenCV and the VTK that MAVProxy's maps want.
 # The stamp hangs on the files that say what to install, so a change there installs again.
 $(STAMP): pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): about 45 s and 1.5 GB on a good line, once."
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps MAVProxy dronekit2
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps MAVProxy
 	@touch $(STAMP)
 
 clean:

