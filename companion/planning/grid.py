@@ -123,28 +123,34 @@ def build_steps(field, bands, radius_m, resolution_m, steps):  # type: ignore[no
 
 @njit(cache=True, nogil=True)
 def fill_nearest(ground, gap):  # type: ignore[no-untyped-def]
-    """Replace NaN by the value of the (about) nearest cell that has one: two chamfer sweeps."""
+    """Replace NaN by the value of the (about) nearest cell that has one: two chamfer sweeps.
+
+    `gap` (X + 2, Y + 2) is scratch; its rim is infinitely far, so that no neighbour is out of bounds.
+    """
     nx, ny = ground.shape
+    gap[:] = np.float32(1e9)
     for i in range(nx):
         for j in range(ny):
-            gap[i, j] = np.float32(1e9) if np.isnan(ground[i, j]) else np.float32(0.0)
-    for side in range(-1, 2, 2):
+            if not np.isnan(ground[i, j]):
+                gap[i + 1, j + 1] = np.float32(0.0)
+    for side in (-1, 1):
         for a in range(nx):
             i = a if side < 0 else nx - 1 - a
             for b in range(ny):
                 j = b if side < 0 else ny - 1 - b
-                _take(ground, gap, i, j, i, j + side)
-                for n in range(-1, 2):
-                    _take(ground, gap, i, j, i + side, j + n)
+                if gap[i + 1, j + 1] > np.float32(0.0):
+                    _take_nearest(ground, gap, i, j, side)
 
 
 @njit(cache=True, nogil=True)
-def _take(ground, gap, i, j, m, n):  # type: ignore[no-untyped-def]
-    """Cell (i, j) takes the value of its neighbour (m, n) if that knows a nearer one."""
-    if 0 <= m < ground.shape[0] and 0 <= n < ground.shape[1]:
-        through = gap[m, n] + np.float32(1.0 if i == m or j == n else 1.414)
-        if through < gap[i, j]:
-            gap[i, j], ground[i, j] = through, ground[m, n]
+def _take_nearest(ground, gap, i, j, side):  # type: ignore[no-untyped-def]
+    """Cell (i, j) takes the value of that of four neighbours which knows a nearer one, the first of equals."""
+    best, m, n = gap[i + 1, j + 1], i, j
+    for di, dj, way in ((0, side, 1.0), (side, -1, 1.414), (side, 0, 1.0), (side, 1, 1.414)):
+        through = gap[i + 1 + di, j + 1 + dj] + np.float32(way)
+        if through < best:
+            best, m, n = through, i + di, j + dj
+    gap[i + 1, j + 1], ground[i, j] = best, ground[m, n]
 
 
 @njit(cache=True, nogil=True)

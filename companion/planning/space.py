@@ -180,7 +180,7 @@ def fill_ground(local_map: LocalMap, *, fallback_z: float = math.nan) -> Array32
     if np.isnan(ground).all():
         return None if math.isnan(fallback_z) else np.full(ground.shape, fallback_z, np.float32)
     filled = ground.copy()
-    fill_nearest(filled, np.empty_like(filled))
+    fill_nearest(filled, np.empty((filled.shape[0] + 2, filled.shape[1] + 2), np.float32))
     return filled
 
 

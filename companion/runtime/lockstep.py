@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from time import thread_time
+from time import perf_counter, thread_time
 from typing import Any, Protocol
 
 import numpy as np
@@ -87,7 +87,7 @@ class Lockstep:
 
     @property
     def cpu_s(self) -> dict[str, float]:
-        """CPU seconds of this thread per node."""
+        """CPU seconds per node; what has no modelled delay is short, and counted by the wall clock."""
         return {name(seat.node): seat.cpu_s for seat in self._seats}
 
     def compute_ms(self, percent: float) -> dict[str, dict[str, float]]:
@@ -161,12 +161,14 @@ class Lockstep:
         job, seat.job = seat.job, None
         if job is None:
             return
-        started, event = thread_time(), job.event
+        event = job.event
+        clock = thread_time if event.name in seat.delays_ns else perf_counter  # asking for CPU time costs 0.6 us
+        started = clock()
         if event.topic is None:
             job.outputs = list(seat.node.tick(event.name, job.fed_ns))
         else:
             job.outputs = list(seat.node.handle(event.topic, event.message))
-        taken_s = thread_time() - started
+        taken_s = clock() - started
         seat.cpu_s += taken_s
         seat.busy_until_ns = job.fed_ns
         if job.outputs and event.name in seat.delays_ns:
