@@ -6,6 +6,8 @@ import time
 
 import pytest
 
+INCOMPAT_SIGNED = 1
+
 pytestmark = pytest.mark.slow
 
 
@@ -55,8 +57,8 @@ def test_a_signed_flight_completes(fly, keys):
     flight = fly(options=(f"--key={keys[0]}",), sim_options=("--gcs=", f"--key={keys[0]}"))
     assert flight.run.wait(240) == 0, flight.story()
     assert flight.summary()["completed"] and not flight.summary()["contact"]
-    signed = [m for _, m in flight.setpoints() if m.get_signed()]
-    assert len(signed) == len(flight.setpoints()) > 500
+    signed = [m.get_header().incompat_flags & INCOMPAT_SIGNED for _, m in flight.setpoints()]
+    assert all(signed) and len(signed) > 500
 
 
 @pytest.mark.parametrize(
@@ -71,4 +73,5 @@ def test_without_the_vehicles_key_it_never_arms_and_says_why(fly, keys, wishes, 
     summary = flight.summary()
     assert not summary["completed"] and reason in summary["reason"]
     assert wishes(flight, 0.0) == []
+    flight.monitor.look()
     assert not flight.monitor.truth.armed and not flight.monitor.flew
