@@ -27,7 +27,7 @@ class Station:
         from pymavlink import mavutil
 
         self._link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=255, source_component=190)
-        self.modes, self.acks = [], []  # (monotonic s, mode); (command, result)
+        self.modes, self.acks = [], []  # (monotonic s, mode, armed); (command, result)
         self._ended = False
         self._thread = threading.Thread(target=self._listen)
         self._thread.start()
@@ -41,7 +41,8 @@ class Station:
                 self.acks.append((message.command, message.result))
             elif message.get_type() == "HEARTBEAT" and message.get_srcComponent() == 1:
                 mode = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
-                self.modes.append((time.monotonic(), mode))
+                armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+                self.modes.append((time.monotonic(), mode, armed))
 
     def __str__(self):
         return f"newest mode {self.modes[-1:]}, answers {self.acks}"
@@ -56,8 +57,13 @@ class Station:
         return bool(self.modes) and self.modes[-1][1] == PX4[mode]
 
     def left(self, mode, since_s):
-        """Whether the vehicle was in another mode since."""
-        return any(m != PX4[mode] for when, m in self.modes if when > since_s)
+        """Whether the vehicle was in another mode since, with its motors on."""
+        return any(m != PX4[mode] for when, m, armed in self.modes if when > since_s and armed)
+
+    @property
+    def last_armed_s(self):
+        """When the vehicle said last that its motors are on."""
+        return max(when for when, _, armed in self.modes if armed)
 
     def close(self):
         self._ended = True
