@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from types import FrameType
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from companion.cli.signals import on_interrupt
 from companion.core.errors import CompanionError
 from companion.runtime.bus.session import ENDPOINT
 
@@ -34,17 +33,13 @@ def stopping() -> Iterator[Event]:
     """An event that Ctrl-C and SIGTERM set; a second one ends at once."""
     stopped = Event()
 
-    def ask(_signal: int, _frame: FrameType | None) -> None:
+    def ask() -> None:
         if stopped.is_set():
             raise KeyboardInterrupt
         stopped.set()
 
-    before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with on_interrupt(ask):
         yield stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def say(line: str) -> None:

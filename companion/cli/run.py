@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import signal
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.status import Status
 
 from companion.cli.children import recorder
 from companion.cli.flight_input import read_text, stack_config
 from companion.cli.ground_options import Allowed, Certificates, Rates, ground_settings
 from companion.cli.live_outcome import print_live, write_live
+from companion.cli.signals import on_interrupt
 from companion.config import Config, dump_config
 from companion.core import topics
 from companion.core.errors import LinkError
@@ -148,8 +147,8 @@ def fly_live(request: RunRequest, console: Console) -> tuple[LiveSummary, Tracks
 
 def _fly(supervisor: Supervisor, monitor: Monitor, tracks: Tracks, reports: Reports, console: Console) -> str:
     """Start, watch and end the groups; returns why the flight was lost, or ''."""
-    lost, told = "", 0
-    with _interrupts() as interrupts, console.status("starting") as status:
+    lost, told, interrupts = "", 0, _Interrupts()
+    with on_interrupt(interrupts.take), console.status("starting") as status:
         try:
             status.update("compiling kernels (first start: up to a minute of CPU; cached afterwards)")
             supervisor.start()
@@ -192,7 +191,8 @@ def _show(status: Status, monitor: Monitor) -> None:
     height, speed = vehicle.p_odom[2], float((vehicle.v_odom @ vehicle.v_odom) ** 0.5)
     guard = f"   {safety.action}: {safety.reason}" if safety is not None and safety.action != "ok" else ""
     what = mission.reason if mission.state == "waiting" else f"{mission.step_index + 1}/{mission.step_count}"
-    status.update(f"{mission.step_id} {what}   {vehicle.mode}   {height:.1f} m up   {speed:.1f} m/s{guard}")
+    line = f"{mission.step_id} {what}   {vehicle.mode}   {height:.1f} m up   {speed:.1f} m/s{guard}"
+    status.update(escape(line))  # reasons hold the vehicle's own words
 
 
 @dataclass(slots=True)
@@ -200,20 +200,8 @@ class _Interrupts:
     count: int = 0
     answered: bool = False
 
-    def take(self, _signal: int, _frame: FrameType | None) -> None:
+    def take(self) -> None:
         self.count += 1
-
-
-@contextmanager
-def _interrupts() -> Iterator[_Interrupts]:
-    """Ctrl-C and SIGTERM are counted, not raised."""
-    interrupts = _Interrupts()
-    before = {s: signal.signal(s, interrupts.take) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield interrupts
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _refuse_a_second(directory: Directory, request: RunRequest) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import gc
 import math
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any
 
 import msgspec
@@ -17,6 +15,7 @@ import typer
 from rich.console import Console
 
 from companion.cli import simulation
+from companion.cli.signals import on_interrupt
 from companion.core import topics
 from companion.core.errors import CompanionError
 from companion.core.messages import GroundTruth, MavlinkBytes
@@ -110,7 +109,8 @@ def sim(
         key=load_key(key) if key else None,
     )
     console = Console(quiet=quiet, stderr=as_json, soft_wrap=True, highlight=False)
-    with _stopping() as stopped:
+    stopped = Stopped()
+    with on_interrupt(stopped.ask):
         try:
             summary = simulate(request, console, clock=Clock.of_host(), stopped=stopped)
         except KeyboardInterrupt:
@@ -135,23 +135,11 @@ class Stopped:
     def __init__(self) -> None:
         self.asked = self.gently = False
 
-    def ask(self, _signal: int, _frame: FrameType | None) -> None:
-        """Signal handler; a second signal interrupts."""
+    def ask(self) -> None:
+        """Once for the end; a second time interrupts."""
         if self.asked or not self.gently:
             raise KeyboardInterrupt
         self.asked = True
-
-
-@contextmanager
-def _stopping() -> Iterator[Stopped]:
-    """SIGINT and SIGTERM both end the simulation."""
-    stopped = Stopped()
-    before = {s: signal.signal(s, stopped.ask) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def simulate(request: SimRequest, console: Console, *, clock: Clock, stopped: Stopped) -> SimSummary:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from companion.core import topics
 from companion.core.node import Topic
 from companion.runtime.pipes import Beat, NodeBeat
+from companion.runtime.wire.parts import header_of
 
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 OK, WARN, ERROR = 0, 1, 2
@@ -49,8 +50,7 @@ class Diagnoses:
         statuses = [s for report in reports for s in self._of_group(report)]
         statuses += self._of_topics(reports)
         self._before = {r.group: r for r in reports}
-        sec, nanosec = divmod(now_ns, 1_000_000_000)
-        return {"header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""}, "status": statuses}
+        return {"header": header_of(now_ns, ""), "status": statuses}
 
     def _measure(self, report: GroupReport) -> None:
         """Rates of all figures, if there are new ones."""

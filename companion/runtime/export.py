@@ -19,7 +19,7 @@ from companion.runtime.flight_folder import kinds_of, logs_of, read_header, rebu
 from companion.runtime.log_file import Header, Message
 from companion.runtime.mcap_file import McapFile, Sample, offered
 from companion.runtime.replay import Replay
-from companion.runtime.viewer import View, sensor_frames, views_of
+from companion.runtime.viewer import TF_STATIC, View, sensor_frames, views_of
 from companion.runtime.wire import WireType, codec_of, wire_type
 from companion.runtime.wire.qos import Qos, qos_of
 
@@ -75,9 +75,14 @@ class _Writer:
             self._view(time_ns, message.stamp_ns, view)
 
     def _view(self, time_ns: int, stamp_ns: int, view: View) -> None:
-        name = view.topic if view.shared else f"{self._vehicle}/{view.topic}"
-        kind, qos = wire_type(view.type), STATIC if view.topic == "tf_static" else SHOWN
-        self._put(name, kind, kind.encode(view.value), (time_ns, stamp_ns), qos)
+        kind, qos = wire_type(view.where.type), STATIC if view.where is TF_STATIC else SHOWN
+        self._put(
+            view.where.full_name(self._vehicle).removeprefix("/"),
+            kind,
+            kind.encode(view.value),
+            (time_ns, stamp_ns),
+            qos,
+        )
 
     def _put(self, topic: str, kind: WireType, payload: bytes, times: tuple[int, int], qos: Qos) -> None:
         log_ns, publish_ns = times

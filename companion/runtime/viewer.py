@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from companion.core.messages import (
 )
 from companion.core.node import Topic
 from companion.core.rig import Mount, Rig
+from companion.runtime.wire.parts import header_of, quaternion_of, time_of
 
 _FLOAT32 = 7  # sensor_msgs/PointField
 _INFO, _WARN, _ERROR = 20, 30, 40  # rcl_interfaces/Log
@@ -40,28 +41,45 @@ _OCCUPIED = 2  # LocalMap.state
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """One message of a standard type; `shared` topics stand outside the vehicle's namespace, as ROS wants them."""
-
-    topic: str
-    type: str
-    value: dict[str, Any]
-    shared: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class ViewTopic:
-    """What a view will be called, for who must announce it before the first."""
+    """Where a view goes; `shared` topics stand outside the vehicle's namespace, as ROS wants them."""
 
     topic: str
     type: str
     shared: bool = False
+
+    def full_name(self, vehicle: str) -> str:
+        """On the bus."""
+        return f"/{self.topic}" if self.shared else f"/{vehicle}/{self.topic}"
+
+
+class View(NamedTuple):
+    """One message of a standard type."""
+
+    where: ViewTopic
+    value: dict[str, Any]
+
+
+TF = ViewTopic("tf", "tf2_msgs/msg/TFMessage", shared=True)
+TF_STATIC = ViewTopic("tf_static", "tf2_msgs/msg/TFMessage", shared=True)
+ODOM = ViewTopic("odom", "nav_msgs/msg/Odometry")
+CLOUD = ViewTopic("cloud", "sensor_msgs/msg/PointCloud2")
+OCCUPIED = ViewTopic("map/occupied", "sensor_msgs/msg/PointCloud2")
+PATH = ViewTopic("path", "nav_msgs/msg/Path")
+PLAN = ViewTopic("plan", "nav_msgs/msg/Path")
+GOAL = ViewTopic("goal", "geometry_msgs/msg/PoseStamped")
+ROSOUT = ViewTopic("rosout", "rcl_interfaces/msg/Log", shared=True)
 
 
 def views_of(topic: Topic[Any], message: Any) -> Iterator[View]:
     """What a viewer is told because of one of our messages."""
-    if make := _VIEWS.get(topic.name):
-        yield from make(message)
+    if topic.name in _VIEWS:
+        yield from _VIEWS[topic.name][0](message)
+
+
+def announced(topic: Topic[Any]) -> tuple[ViewTopic, ...]:
+    """Where the views of a topic will go, for who must declare it before the first."""
+    return _VIEWS[topic.name][1] if topic.name in _VIEWS else ()
 
 
 def sensor_frames(rig: Rig) -> View:
@@ -71,7 +89,7 @@ def sensor_frames(rig: Rig) -> View:
         _transform(0, "base_link", child, mount.p_body, quaternion_from_rotation(mount.R_body_sensor))
         for child, mount in mounts.items()
     ]
-    return View("tf_static", "tf2_msgs/msg/TFMessage", {"transforms": parts}, shared=True)
+    return View(TF_STATIC, {"transforms": parts})
 
 
 def _odometry(o: Odometry) -> Iterator[View]:
@@ -80,7 +98,7 @@ def _odometry(o: Odometry) -> Iterator[View]:
     covariance, rates = np.diag(np.concatenate([o.pose_variance[3:], o.pose_variance[:3]])), np.zeros((6, 6))
     rates[:3, :3] = R_odom_body.T @ np.diag(o.velocity_variance) @ R_odom_body
     value = {
-        "header": _header(o.stamp_ns, "odom"),
+        "header": header_of(o.stamp_ns, "odom"),
         "child_frame_id": "base_link",
         "pose": {"pose": _pose(o.p_odom, o.q_odom_body), "covariance": covariance.ravel()},
         "twist": {
@@ -91,7 +109,7 @@ def _odometry(o: Odometry) -> Iterator[View]:
             "covariance": rates.ravel(),
         },
     }
-    yield View("odom", "nav_msgs/msg/Odometry", value)
+    yield View(ODOM, value)
 
 
 def _smoothed(s: SmoothedState) -> Iterator[View]:
@@ -99,79 +117,67 @@ def _smoothed(s: SmoothedState) -> Iterator[View]:
 
 
 def _registered(scan: RegisteredScan) -> Iterator[View]:
-    yield View("cloud", "sensor_msgs/msg/PointCloud2", _cloud(scan.stamp_ns, "base_link", scan.points_body))
+    yield View(CLOUD, _cloud(scan.stamp_ns, "base_link", scan.points_body))
 
 
 def _map(m: LocalMap) -> Iterator[View]:
     """Centres of the occupied cells."""
     cells = np.argwhere(m.state == _OCCUPIED)
     points = (m.origin_odom + (cells + 0.5) * m.resolution_m).astype(np.float32)
-    yield View("map/occupied", "sensor_msgs/msg/PointCloud2", _cloud(m.stamp_ns, "odom", points))
+    yield View(OCCUPIED, _cloud(m.stamp_ns, "odom", points))
 
 
 def _trajectory(t: Trajectory) -> Iterator[View]:
-    yield _path("path", t.stamp_ns, t.p_odom)
+    yield _path(PATH, t.stamp_ns, t.p_odom)
 
 
 def _plan(p: PlanStatus) -> Iterator[View]:
-    yield _path("plan", p.stamp_ns, p.plan_p_odom)
+    yield _path(PLAN, p.stamp_ns, p.plan_p_odom)
 
 
 def _goal(g: Goal) -> Iterator[View]:
-    value = {"header": _header(g.stamp_ns, "odom"), "pose": {"position": _xyz(g.p_odom)}}
-    yield View("goal", "geometry_msgs/msg/PoseStamped", value)
+    value = {"header": header_of(g.stamp_ns, "odom"), "pose": {"position": _xyz(g.p_odom)}}
+    yield View(GOAL, value)
 
 
 def _why(w: Why) -> Iterator[View]:
     text = f"{w.what}: {w.because}"
     level = _LEVELS.get((w.node, w.what), _INFO)
-    value = {"stamp": _header(w.stamp_ns, "")["stamp"], "level": level, "name": w.node, "msg": text}
-    yield View("rosout", "rcl_interfaces/msg/Log", value, shared=True)
+    value = {"stamp": time_of(w.stamp_ns), "level": level, "name": w.node, "msg": text}
+    yield View(ROSOUT, value)
 
 
-_FRAMES = ViewTopic("tf", "tf2_msgs/msg/TFMessage", shared=True)
-ANNOUNCED: dict[str, tuple[ViewTopic, ...]] = {
-    topics.ODOMETRY.name: (_FRAMES, ViewTopic("odom", "nav_msgs/msg/Odometry")),
-    topics.SMOOTHED.name: (_FRAMES,),
-    topics.REGISTERED.name: (ViewTopic("cloud", "sensor_msgs/msg/PointCloud2"),),
-    topics.LOCAL_MAP.name: (ViewTopic("map/occupied", "sensor_msgs/msg/PointCloud2"),),
-    topics.TRAJECTORY.name: (ViewTopic("path", "nav_msgs/msg/Path"),),
-    topics.PLAN.name: (ViewTopic("plan", "nav_msgs/msg/Path"),),
-    topics.GOAL.name: (ViewTopic("goal", "geometry_msgs/msg/PoseStamped"),),
-    topics.WHY.name: (ViewTopic("rosout", "rcl_interfaces/msg/Log", shared=True),),
-}
-_VIEWS: dict[str, Callable[[Any], Iterator[View]]] = {
-    topics.ODOMETRY.name: _odometry,
-    topics.SMOOTHED.name: _smoothed,
-    topics.REGISTERED.name: _registered,
-    topics.LOCAL_MAP.name: _map,
-    topics.TRAJECTORY.name: _trajectory,
-    topics.PLAN.name: _plan,
-    topics.GOAL.name: _goal,
-    topics.WHY.name: _why,
+_VIEWS: dict[str, tuple[Callable[[Any], Iterator[View]], tuple[ViewTopic, ...]]] = {
+    topics.ODOMETRY.name: (_odometry, (TF, ODOM)),
+    topics.SMOOTHED.name: (_smoothed, (TF,)),
+    topics.REGISTERED.name: (_registered, (CLOUD,)),
+    topics.LOCAL_MAP.name: (_map, (OCCUPIED,)),
+    topics.TRAJECTORY.name: (_trajectory, (PATH,)),
+    topics.PLAN.name: (_plan, (PLAN,)),
+    topics.GOAL.name: (_goal, (GOAL,)),
+    topics.WHY.name: (_why, (ROSOUT,)),
 }
 
 
 def _frame(stamp_ns: int, parent: str, child: str, p: Array, q: Array) -> View:
-    value = {"transforms": [_transform(stamp_ns, parent, child, p, q)]}
-    return View("tf", "tf2_msgs/msg/TFMessage", value, shared=True)
+    return View(TF, {"transforms": [_transform(stamp_ns, parent, child, p, q)]})
 
 
 def _transform(stamp_ns: int, parent: str, child: str, p: Array, q: Array) -> dict[str, Any]:
-    place = {"translation": _xyz(p), "rotation": _quaternion(q)}
-    return {"header": _header(stamp_ns, parent), "child_frame_id": child, "transform": place}
+    place = {"translation": _xyz(p), "rotation": quaternion_of(q)}
+    return {"header": header_of(stamp_ns, parent), "child_frame_id": child, "transform": place}
 
 
-def _path(name: str, stamp_ns: int, points: Array) -> View:
-    header = _header(stamp_ns, "odom")
+def _path(where: ViewTopic, stamp_ns: int, points: Array) -> View:
+    header = header_of(stamp_ns, "odom")
     poses = [{"header": header, "pose": {"position": _xyz(p)}} for p in points]
-    return View(name, "nav_msgs/msg/Path", {"header": header, "poses": poses})
+    return View(where, {"header": header, "poses": poses})
 
 
 def _cloud(stamp_ns: int, frame: str, points: Array32) -> dict[str, Any]:
     names = enumerate(("x", "y", "z"))
     return {
-        "header": _header(stamp_ns, frame),
+        "header": header_of(stamp_ns, frame),
         "height": 1,
         "width": len(points),
         "fields": [{"name": n, "offset": 4 * k, "datatype": _FLOAT32, "count": 1} for k, n in names],
@@ -183,20 +189,10 @@ def _cloud(stamp_ns: int, frame: str, points: Array32) -> dict[str, Any]:
     }
 
 
-def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
-    seconds, rest = divmod(stamp_ns, 1_000_000_000)
-    return {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": frame}
-
-
 def _pose(p: Array, q: Array) -> dict[str, Any]:
-    return {"position": _xyz(p), "orientation": _quaternion(q)}
+    return {"position": _xyz(p), "orientation": quaternion_of(q)}
 
 
 def _xyz(p: Array) -> dict[str, float]:
     x, y, z = p.tolist()
     return {"x": x, "y": y, "z": z}
-
-
-def _quaternion(q: Array) -> dict[str, float]:
-    w, x, y, z = q.tolist()
-    return {"x": x, "y": y, "z": z, "w": w}

@@ -10,6 +10,7 @@ from companion.runtime.clock import Clock
 from companion.runtime.diagnostics import TYPE, Diagnoses, GroupReport
 from companion.runtime.wire import wire_type
 from companion.runtime.wire.keys import Qos
+from companion.runtime.wire.parts import time_of
 
 PERIOD_NS = 1_000_000_000
 WARN = 30  # rcl_interfaces/msg/Log
@@ -41,7 +42,6 @@ class Reports:
     def event(self, text: str) -> None:
         """Something happened that an operator should know."""
         now_ns = self.clock.now_ns()
-        sec, nanosec = divmod(now_ns, 1_000_000_000)
         name = f"{self._vehicle}.supervisor"
-        value = {"stamp": {"sec": sec, "nanosec": nanosec}, "level": WARN, "name": name, "msg": text}
+        value = {"stamp": time_of(now_ns), "level": WARN, "name": name, "msg": text}
         self._rosout.put(self._log.encode(value), now_ns)

@@ -11,6 +11,7 @@ from companion.runtime.bus.graph import Arrival, Graph
 from companion.runtime.clock import Clock
 from companion.runtime.wire import wire_type
 from companion.runtime.wire.keys import Qos
+from companion.runtime.wire.parts import ns_of
 
 SAMPLES: Final = 25  # half a second: the quickest of them sets the clock
 TIMEOUT_S: Final = 10.0
@@ -24,8 +25,7 @@ def join_clock(graph: Graph, host: Clock, *, speed: float) -> Clock:
     heard: list[tuple[int, int]] = []  # (host, simulator), ns
 
     def take(arrival: Arrival) -> None:
-        told = kind.decode(arrival.payload)["clock"]
-        heard.append((host.now_ns(), told["sec"] * 1_000_000_000 + told["nanosec"]))
+        heard.append((host.now_ns(), ns_of(kind.decode(arrival.payload)["clock"])))
 
     graph.node("clock_follower").subscribe("/clock", kind, Qos(reliable=False, depth=1), take)
     until_s = time.monotonic() + TIMEOUT_S

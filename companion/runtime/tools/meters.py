@@ -11,6 +11,7 @@ import numpy as np
 from companion.core.errors import CompanionError
 from companion.runtime.bus.gaps import Gaps
 from companion.runtime.tools.ear import Heard
+from companion.runtime.wire.parts import stamp_of
 
 Report = dict[str, float]
 
@@ -130,8 +131,7 @@ Meter = RateMeter | BandwidthMeter | DelayMeter
 def stamp_ns_of(value: dict[str, Any]) -> int:
     """Of `header.stamp`; CompanionError if there is none."""
     try:
-        stamp = value["header"]["stamp"]
-        return int(stamp["sec"]) * 1_000_000_000 + int(stamp["nanosec"])
+        return stamp_of(value["header"])
     except KeyError:
         raise CompanionError("the type has no header with a stamp: its delay cannot be measured") from None
 

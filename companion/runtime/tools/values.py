@@ -8,6 +8,7 @@ import yaml
 
 from companion.core.errors import InputError
 from companion.runtime.wire import WireType
+from companion.runtime.wire.parts import time_of
 
 HEADER, TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
 
@@ -29,9 +30,9 @@ def stamped(kind: WireType, value: Any, now_ns: int) -> Any:
     YAML takes 1e-3 for a word (it wants 1.0e-3): where the type wants a number it is one.
     """
     if kind.name == HEADER and value == "auto":
-        return {"stamp": _time(now_ns)}
+        return {"stamp": time_of(now_ns)}
     if kind.name == TIME and value == "now":
-        return _time(now_ns)
+        return time_of(now_ns)
     if not isinstance(value, dict):
         return value
     fields = {f.name: f.type for f in kind.fields}
@@ -53,11 +54,6 @@ def short_name(text: str, kind: str) -> str:
     """`std_msgs/String` or `std_msgs/msg/String` as the latter; `kind` is msg or srv."""
     parts = text.strip("/").split("/")
     return f"{parts[0]}/{kind}/{parts[1]}" if len(parts) == 2 else text
-
-
-def _time(now_ns: int) -> dict[str, int]:
-    sec, nanosec = divmod(now_ns, 1_000_000_000)
-    return {"sec": sec, "nanosec": nanosec}
 
 
 def _number(value: Any) -> Any:

@@ -24,7 +24,7 @@ import numpy as np
 
 from companion.core.messages import Array, Array32, LidarScan, freeze
 from companion.runtime.wire.errors import WireError
-from companion.runtime.wire.own import header_of, stamp_of
+from companion.runtime.wire.parts import header_of, stamp_of
 
 FIELDS = ("x", "y", "z", "age_s", "beam_x", "beam_y", "beam_z")
 TIME_FIELDS = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset")

@@ -17,6 +17,7 @@ import numpy as np
 from companion.core import messages as m
 from companion.runtime.wire.errors import WireError
 from companion.runtime.wire.idl import Field
+from companion.runtime.wire.parts import header_of, quaternion_of, stamp_of
 from companion.runtime.wire.types import WireType
 
 PACKAGE = "understory_msgs"
@@ -70,7 +71,7 @@ class _Source:
             return
         if base == "geometry_msgs/msg/Quaternion":
             self._there.append(f"{name!r}: quaternion({there})")
-            self._names.update(quaternion=_quaternion)
+            self._names.update(quaternion=quaternion_of)
             self._back.append(f"{name}=array(({back}['w'], {back}['x'], {back}['y'], {back}['z']))")
             return
         if base.startswith(f"{PACKAGE}/"):
@@ -107,23 +108,6 @@ class _Source:
             self._names,
         )
         return self._names["to_value"], self._names["from_value"]
-
-
-def header_of(stamp_ns: int, frame: str) -> dict[str, Any]:
-    """std_msgs/Header."""
-    seconds, rest = divmod(stamp_ns, 1_000_000_000)
-    return {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": frame}
-
-
-def stamp_of(header: dict[str, Any]) -> int:
-    """Stamp of a std_msgs/Header, ns."""
-    stamp = header["stamp"]
-    return int(stamp["sec"] * 1_000_000_000 + stamp["nanosec"])
-
-
-def _quaternion(q: m.Array) -> dict[str, float]:
-    w, x, y, z = q.tolist()
-    return {"x": x, "y": y, "z": z, "w": w}
 
 
 def _choose(field: str, value: str, choices: tuple[str, ...]) -> str:

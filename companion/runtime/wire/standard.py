@@ -9,7 +9,7 @@ import numpy as np
 
 from companion.core.messages import BaroReading, Bytes2D, CameraImage, ImuSample, RangeReading, freeze
 from companion.runtime.wire.errors import WireError
-from companion.runtime.wire.own import header_of, stamp_of
+from companion.runtime.wire.parts import header_of, stamp_of
 
 _ZERO_COVARIANCE = np.zeros(9)  # ROS: unknown
 _NO_ORIENTATION = np.array([-1.0, *[0.0] * 8])  # ROS: the message says nothing of it

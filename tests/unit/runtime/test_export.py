@@ -103,7 +103,7 @@ def test_odometry_in_ros_turns_velocity_and_its_variance_into_the_body():
     assert np.allclose(TILT @ variance @ TILT.T, np.diag([1.0, 2.0, 3.0]))
     pose = odom.value["pose"]["covariance"].reshape(6, 6)
     assert np.allclose(np.diag(pose), [4, 5, 6, 1, 2, 3])  # ROS: position first
-    assert tf.shared and not odom.shared
+    assert tf.where.shared and not odom.where.shared
 
 
 def test_sensor_frames_are_the_rigs():
