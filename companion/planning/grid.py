@@ -107,18 +107,27 @@ def build_steps(field, bands, radius_m, resolution_m, steps):  # type: ignore[no
     scale = np.float32(JUMP_UNIT / resolution_m)
     radius = np.float32(radius_m - 1e-4)
     loss = np.float32(JUMP_UNIT * math.sqrt(3.0))
-    most = np.float32(JUMP_UNIT * _FARTHEST_JUMP)
     for i in range(nx):
         for j in range(ny):
-            bottom, top = near_low[i, j] + 1, near_high[i, j] - 1
             first, last = low[i, j], high[i, j]
             steps[i, j, :] = 0
-            for k in range(first, last + 1):
-                d = field[i, j, k] - radius
-                if d >= np.float32(0.0):
-                    room = np.float32(min(k - bottom, top - k) * JUMP_UNIT)
-                    jump = min(d * scale - loss, room, most)
-                    steps[i, j, k] = np.uint8(1 + int(max(jump, np.float32(0.0))))
+            if first <= last:
+                above, below = np.int32(first - near_low[i, j] - 1), np.int32(near_high[i, j] - 1 - first)
+                _build_column(
+                    field[i, j, first : last + 1], steps[i, j, first : last + 1], (radius, scale, loss), above, below
+                )
+
+
+@njit(cache=True, nogil=True)
+def _build_column(field, steps, units, above, below):  # type: ignore[no-untyped-def]
+    """`above`, `below`: cells from the first to the borders that bound a jump. No branch, so it is vectorised."""
+    radius, scale, loss = units
+    most, zero, unit = np.float32(JUMP_UNIT * _FARTHEST_JUMP), np.float32(0.0), np.float32(JUMP_UNIT)
+    for k in range(len(field)):
+        d = field[k] - radius
+        room = np.float32(min(above + np.int32(k), below - np.int32(k))) * unit
+        jump = max(min(min(d * scale - loss, room), most), zero)
+        steps[k] = np.uint8(np.int32(jump) + np.int32(1)) if d >= zero else np.uint8(0)
 
 
 @njit(cache=True, nogil=True)

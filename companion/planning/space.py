@@ -187,10 +187,13 @@ def fill_ground(local_map: LocalMap, *, fallback_z: float = math.nan) -> Array32
 def _highest_near(cells: Cells) -> Cells:
     """Maximum (X, Y) over the square of +- WINDOW columns."""
     for axis in (0, 1):
-        wide = np.pad(cells, [(WINDOW, WINDOW) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        parts = [np.take(wide, np.arange(n, n + cells.shape[axis]), axis=axis) for n in range(2 * WINDOW + 1)]
-        cells = np.maximum.reduce(parts)
-    return cells
+        along = np.moveaxis(cells, axis, 0)
+        near = along.copy()
+        for n in range(1, WINDOW + 1):
+            np.maximum(near[n:], along[:-n], out=near[n:])
+            np.maximum(near[:-n], along[n:], out=near[:-n])
+        cells = np.moveaxis(near, 0, axis)
+    return np.ascontiguousarray(cells)
 
 
 def _clip(p: Array, q: Array, shape: Array) -> tuple[float, float] | None:
