@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from companion.cli.mission import read_text
+from companion.cli.flight_input import read_text
 from companion.config import Config, apply_overrides, dump_config, load_config
 
 

@@ -15,10 +15,9 @@ def stack_config(file: Path | None, overrides: tuple[str, ...]) -> Config:
 
 
 def read_text(file: Path) -> str:
-    """The text of a YAML file; raises InputError that names it."""
+    """The text of a file; raises InputError that names it."""
     try:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read: {error.__class__.__name__}", file=str(file), valid="a YAML text file"
-        ) from error
+        why = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror or "cannot be read"
+        raise InputError(why, file=str(file), valid="a YAML text file") from error

@@ -28,7 +28,15 @@ COMMANDS = {  # command -> module and function in companion.cli
     "odometry": "odometry:odometry",
 }
 GROUPS = {  # group -> help, command -> module and function
-    "mission": ("Check mission files.", {"check": "mission:check", "table": "mission:table"}),
+    "mission": (
+        "Check mission files; store them in an autopilot.",
+        {
+            "check": "mission:check",
+            "table": "mission:table",
+            "upload": "mission:upload",
+            "download": "mission:download",
+        },
+    ),
     "config": ("Show the configuration.", {"dump": "config:dump"}),
     "keys": (
         "Make and check keys: of MAVLink signing, and of the ground link.",

@@ -1,4 +1,4 @@
-"""`companion mission check`: a dry run of a mission file."""
+"""`companion mission`: a dry run of a mission file, and its way into an autopilot's memory."""
 
 from __future__ import annotations
 
@@ -12,9 +12,16 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from companion.autopilot.mission_items import described
+from companion.cli.bus_options import say
+from companion.cli.flight_input import read_text
+from companion.cli.param import VEHICLE, Vehicle, WaitS
 from companion.core.errors import InputError
 from companion.mission.estimate import StepEstimate, estimate, total_time_s
 from companion.mission.model import Mission, parse_mission
+from companion.mission.on_earth import Origin, places_of
+from companion.runtime.ports.ground_station import FIRST_HEARTBEAT_S
+from companion.runtime.ports.mission_transfer import MissionTransfer, items_of
 
 
 def check(
@@ -37,13 +44,47 @@ def check(
         _print(parsed, rows, share)
 
 
-def read_text(file: Path) -> str:
-    """The text of a file; raises InputError."""
+def upload(
+    mission: Annotated[Path, typer.Argument(help="Mission YAML of takeoff, goto, survey, hover, return, land.")],
+    origin: Annotated[str, typer.Option(metavar="LAT,LON,HEADING", help="Home, degrees; heading: where x points.")],
+    vehicle: Vehicle = VEHICLE,
+    wait_s: WaitS = FIRST_HEARTBEAT_S,
+) -> None:
+    """Store MISSION in the autopilot, which flies it by GPS, without a companion's eyes.
+
+    Example: companion mission upload missions/hop.yaml --origin 47.3977,8.5456,90
+
+    Exit code 1: the autopilot refuses it; 2: it has no places on Earth; 3: no vehicle.
+    """
+    parsed = parse_mission(read_text(mission), file=str(mission))
+    items = items_of(places_of(parsed, _origin(origin)))
+    with MissionTransfer(vehicle, wait_s=wait_s) as transfer:
+        transfer.upload(items)
+    say(f"{parsed.name}: {len(items)} items stored and read back; nothing in them knows of trees")
+
+
+def download(
+    vehicle: Vehicle = VEHICLE,
+    wait_s: WaitS = FIRST_HEARTBEAT_S,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, one item per line.")] = False,
+) -> None:
+    """Print the mission that the autopilot has stored. Example: companion mission download
+
+    Exit code 3: no vehicle.
+    """
+    with MissionTransfer(vehicle, wait_s=wait_s) as transfer:
+        items = transfer.download()
+    for number, item in enumerate(items, 1):
+        say(msgspec.json.encode(item._asdict()).decode() if as_json else f"{number:3d}  {described(item)}")
+    if not items and not as_json:
+        say("no mission is stored")
+
+
+def _origin(text: str) -> Origin:
     try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        why = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror or "cannot be read"
-        raise InputError(why, file=str(file), valid="a YAML text file") from error
+        return Origin(*(float(part) for part in text.split(",")))
+    except (TypeError, ValueError):
+        raise InputError(f"{text!r} is no place", field="--origin", valid="LAT,LON,HEADING in degrees") from None
 
 
 def _json(mission: Mission, rows: tuple[StepEstimate, ...], share: float) -> str:

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from companion.cli.bus_options import say, warn
 from companion.core.errors import CompanionError, InputError, LinkError
+from companion.runtime.ports.ground_station import FIRST_HEARTBEAT_S
 from companion.runtime.ports.parameter_file import Difference, Entry, differences, read_entries, write_text
 from companion.runtime.ports.parameters import (
-    FIRST_HEARTBEAT_S,
     Parameters,
     Refused,
     Value,

@@ -173,7 +173,7 @@ def _fly(supervisor: Supervisor, monitor: Monitor, tracks: Tracks, reports: Repo
             _tell(supervisor, told, reports, console)
     if killed:
         console.print(f"had to be killed: {', '.join(killed)}")
-    return lost
+    return lost or ("stopped by Ctrl-C" if interrupts.count else "")
 
 
 def _tell(supervisor: Supervisor, told: int, reports: Reports, console: Console) -> int:

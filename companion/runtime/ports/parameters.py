@@ -5,10 +5,8 @@
         parameters.set("MPC_XY_P", 0.7)    # 0.7, read back; Refused if the vehicle kept another value
         parameters.all()                   # {"BAT1_N_CELLS": 4, ...}
 
-The only module beside `companion.autopilot` that may import a MAVLink library: transfers are requests that
-wait for answers, beside the flight and never in it, and MAVSDK does them for PX4 and ArduPilot. It is an
-optional extra, imported when a vehicle is opened. MAVSDK 4.1 cannot sign: a vehicle that wants signed frames is heard,
-and does not answer.
+Transfers are requests that wait for answers, beside the flight and never in it; MAVSDK does them for PX4 and
+ArduPilot.
 """
 
 from __future__ import annotations
@@ -18,20 +16,16 @@ from collections.abc import Collection
 from contextlib import suppress
 from difflib import get_close_matches
 from types import TracebackType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from companion.core.errors import CompanionError, InputError, LinkError
-from companion.runtime.ports.endpoint import Endpoint, parse_endpoint
+from companion.runtime.ports.ground_station import FIRST_HEARTBEAT_S, GroundStation
 
 Value = int | float
-FIRST_HEARTBEAT_S: Final = 10.0
 INT_MIN, INT_MAX = -(2**31), 2**31 - 1
 NEAREST: Final = 5
-_SCHEME: Final = {"tcp": "tcpout"}  # MAVSDK's word, where it is another than ours
-_BUSY: Final = "is another ground station listening there?"
-INSTALL: Final = "parameters need MAVSDK: run `python -m pip install 'understory[mavsdk]'`"
 
 
 class Refused(CompanionError):
@@ -43,47 +37,18 @@ class Refused(CompanionError):
 
 
 def open_parameters(url: str, *, wait_s: float = FIRST_HEARTBEAT_S) -> Parameters:
-    """Connect, and wait for an autopilot's heartbeat. `udp://` listens, as a ground station does.
-
-    Raises InputError for a bad URL, CompanionError without MAVSDK, LinkError if nobody is heard within `wait_s`.
-    """
-    endpoint = parse_endpoint(url, udp_means="in", field="--vehicle")
-    if ":" in endpoint.host:
-        raise InputError(f"{url!r}: MAVSDK has no IPv6", field="--vehicle", valid="a name or an IPv4 address")
-    return Parameters(endpoint, wait_s=wait_s)
+    """Connect, and wait for an autopilot's heartbeat; raises what `GroundStation` raises."""
+    return Parameters(url, wait_s=wait_s)
 
 
 class Parameters:
     """See `open_parameters`; a context manager. Every call ends within some seconds, answered or not."""
 
-    def __init__(self, endpoint: Endpoint, *, wait_s: float) -> None:
-        self._endpoint = endpoint
-        self._mavsdk, self._plugin = _libraries()
-        mavsdk = self._mavsdk
-        mavsdk.log_subscribe(_keep_quiet)
-        station = mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
-        self._sdk = mavsdk.Mavsdk(station)
-        try:
-            self._system = self._connect(mavsdk.ConnectionResult, wait_s)
-            self._parameters = self._plugin.Param(self._system)
-        except BaseException:
-            self.close()
-            raise
+    def __init__(self, url: str, *, wait_s: float) -> None:
+        self._station = GroundStation(url, "param", wait_s=wait_s)
+        self._plugin = self._station.plugin
+        self._parameters = self._plugin.Param(self._station.system)
         self._lost = False
-
-    def _connect(self, result: Any, wait_s: float) -> Any:
-        scheme, rest = str(self._endpoint).split("://", 1)
-        code = result(self._sdk.add_any_connection(f"{_SCHEME.get(scheme, scheme)}://{rest}"))
-        if code != result.SUCCESS:
-            hint = _BUSY if code == result.BIND_ERROR else ""
-            raise LinkError(f"{self._endpoint}: {code.name.lower().replace('_', ' ')}; {hint}".rstrip("; "))
-        system = self._sdk.first_autopilot(wait_s)
-        if system is None:
-            raise LinkError(
-                f"{self._endpoint}: no autopilot heard within {wait_s:g} s: "
-                "does the vehicle send there? `companion sim` sends to udp://127.0.0.1:14550"
-            )
-        return system
 
     def all(self) -> dict[str, Value]:
         """Every parameter by name, sorted; raises LinkError if the list does not come whole."""
@@ -93,7 +58,7 @@ class Parameters:
         values |= {p.name: single(p.value) for p in found.float_params}
         if not values:
             self._lost = True  # MAVSDK 4.1 aborts the process at the next request after a list that never came
-            raise self._silent("the list of parameters")
+            raise self._station.silent("the list of parameters")
         return dict(sorted(values.items()))
 
     def get(self, name: str) -> Value:
@@ -121,7 +86,7 @@ class Parameters:
             (send.set_param_int if isinstance(value, int) else send.set_param_float)(name, value)
         kept = self._read(name)
         if kept is None:
-            raise self._silent(name)
+            raise self._station.silent(name)
         if not same(kept, value):
             raise Refused(name, value, kept)
         return kept
@@ -140,38 +105,19 @@ class Parameters:
             return None
 
     def _check_link(self) -> None:
-        if self._lost or not self._system.is_connected():
-            raise LinkError(f"{self._endpoint}: the autopilot is not heard any more")
-
-    def _silent(self, what: str) -> LinkError:
-        hint = "if its link is signed, MAVSDK cannot talk to it: use a link without a key"
-        return LinkError(f"{self._endpoint}: the autopilot does not answer about {what}; {hint}")
+        if self._lost:
+            raise LinkError(f"{self._station.endpoint}: the autopilot is not heard any more")
+        self._station.check_link()
 
     def close(self) -> None:
         """End MAVSDK's threads and close the connection."""
-        self._sdk.destroy()
-        self._mavsdk.log_unsubscribe()
+        self._station.close()
 
     def __enter__(self) -> Parameters:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
-
-
-def _libraries() -> tuple[Any, Any]:
-    """MAVSDK and its parameter plug-in."""
-    try:
-        import mavsdk
-        from mavsdk.plugins.param import param
-    except ImportError as error:
-        raise CompanionError(INSTALL) from error
-    return mavsdk, param
-
-
-def _keep_quiet(_level: object, _message: str, _file: str | None, _line: int) -> bool:
-    """MAVSDK's own words do not belong into the output; its results come as codes."""
-    return True
 
 
 def single(value: float) -> float:

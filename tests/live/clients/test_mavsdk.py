@@ -8,6 +8,7 @@ mavsdk = pytest.importorskip("mavsdk", reason="MAVSDK is an extra: pip install '
 
 from mavsdk.plugins.action import Action, ActionError  # noqa: E402
 from mavsdk.plugins.mission.mission import Mission, MissionItem, MissionPlan  # noqa: E402
+from mavsdk.plugins.mission_raw.mission_raw import MissionRaw  # noqa: E402
 from mavsdk.plugins.offboard.offboard import (  # noqa: E402
     Offboard,
     PositionNedYaw,
@@ -16,6 +17,10 @@ from mavsdk.plugins.offboard.offboard import (  # noqa: E402
 )
 from mavsdk.plugins.param.param import Param  # noqa: E402
 from mavsdk.plugins.telemetry import FlightMode, LandedState, Telemetry  # noqa: E402
+
+from companion.mission.model import parse_mission  # noqa: E402
+from companion.mission.on_earth import Origin, places_of  # noqa: E402
+from companion.runtime.ports.mission_transfer import MissionTransfer, items_of  # noqa: E402
 
 EARTH_M = 6371000.0
 SPEED = 2.0  # simulated seconds per second
@@ -30,6 +35,7 @@ class Client:
         self.sdk.add_any_connection(f"udpin://127.0.0.1:{port}")
         self.system = self.sdk.first_autopilot(30.0)
         self.action, self.telemetry = Action(self.system), Telemetry(self.system)
+        self.mission_raw = MissionRaw(self.system)
         self.offboard, self.mission, self.param = Offboard(self.system), Mission(self.system), Param(self.system)
 
     @property
@@ -63,6 +69,7 @@ class Client:
 def client(start_sim, until):
     sim = start_sim("--gps", speed=SPEED)
     client = Client(sim.mavlink, until)
+    client.ground = f"udpin://127.0.0.1:{sim.gcs}"
     yield client
     client.sdk.destroy()
     summary = sim.end()
@@ -144,6 +151,22 @@ def test_a_mission_is_uploaded_read_back_and_flown_to_its_end(client, until):
     client.mission.start_mission()
     until(client.mission.is_mission_finished, "the end of the mission", 120.0)
     client.wait_landed()
+
+
+@pytest.mark.slow
+def test_our_own_mission_is_stored_by_the_companion_and_flown_where_it_says(client, until):
+    until(lambda: client.telemetry.health().is_armable, "a vehicle that would arm")
+    home, here = client.telemetry.position(), client.ned
+    steps = "[{do: takeoff, alt: 4}, {do: goto, at: [8, 3, 5]}, {do: hover, seconds: 2}, {do: land}]"
+    text = f"version: 1\nname: m\nsteps: {steps}"
+    origin = Origin(home.latitude_deg, home.longitude_deg, 90.0)  # x points to the east, y to the north
+    with MissionTransfer(client.ground) as transfer:
+        transfer.upload(items_of(places_of(parse_mission(text, file="m"), origin)))
+    client.action.arm()
+    client.mission_raw.start_mission()
+    until(lambda: client.at((here[0] + 3.0, here[1] + 8.0, here[2] + 5.0)), "the place in the mission", 90.0)
+    client.wait_landed()
+    assert math.hypot(client.ned[0] - here[0] - 3.0, client.ned[1] - here[1] - 8.0) < 1.5
 
 
 def waypoint(home, north_m, east_m, up_m):
