@@ -70,6 +70,7 @@ class MappingNode(Node):
             miss_dirs_body=scan.miss_dirs_body,
             free_odom=self._filled_by_vehicle(scan.p_odom),
             own_radius_m=self.config.own_radius_m,
+            stamp_ns=scan.stamp_ns,
         )
         if self.scans % self.config.map_every == 0:
             yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))

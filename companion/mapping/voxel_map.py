@@ -70,19 +70,29 @@ class VoxelMap:
     def __init__(self, config: VoxelMapConfig) -> None:
         self.config = config
         self.resolution_m = config.resolution_m
-        self._steps = quantise(config.sensor)
-        self._blocks = BlockStore()
+        self.steps = quantise(config.sensor)
+        self.blocks = BlockStore()  # for the other files of this package
         self._grid = RayGrid(config.resolution_m, config.max_range_m)
 
     @property
     def block_count(self) -> int:
         """Blocks of 8^3 voxels that hold a known voxel."""
-        return self._blocks.count
+        return self.blocks.count
+
+    @property
+    def version(self) -> int:
+        """Grows with every change of the map."""
+        return self.blocks.version
+
+    def changed_since(self, version: int) -> NDArray[np.int32]:
+        """Positions (K, 3) of the blocks in which a voxel changed its class after `version`."""
+        count = self.blocks.count
+        return self.blocks.xyz[:count][self.blocks.changed_at[:count] > version]
 
     @property
     def memory_bytes(self) -> int:
         """Bytes of the map; the fixed scratch of insertion is not counted."""
-        return self._blocks.memory_bytes
+        return self.blocks.memory_bytes
 
     def insert(
         self,
@@ -94,6 +104,7 @@ class VoxelMap:
         miss_dirs_body: Array32 | None = None,
         free_odom: Array = _NO_POINTS,
         own_radius_m: float = 0.0,
+        stamp_ns: int = 0,
     ) -> Delta:
         """Take in one scan.
 
@@ -102,8 +113,8 @@ class VoxelMap:
         `miss_dirs_body` (M, 3) directions of beams without return, both mapped to odom by
         `R_odom_body` (3, 3); `p_odom` (3,) is the body. The voxels of `free_odom` (K, 3), m,
         are free by other knowledge: one miss. Points nearer to the body's origin than
-        `own_radius_m`, and what is not finite, is dropped. Raises InputError when the pose is
-        not finite or farther than 100 km.
+        `own_radius_m`, and what is not finite, is dropped. `stamp_ns` is when the scan was.
+        Raises InputError when the pose is not finite or farther than 100 km.
         """
         R, p, origin = (np.asarray(a, np.float64) for a in (R_odom_body, p_odom, origin_odom))
         _check_pose(R=R, p_odom=p, origin_odom=origin)
@@ -114,14 +125,14 @@ class VoxelMap:
         hit, steps = self._grid.cast(points, (R, p - origin, origin), (own_radius_m, far_m, False))
         missed, more = self._grid.cast(misses, (R, np.zeros(3), origin), (0.0, clear_m, True))
         self._grid.mark_free(free_odom)
-        met, changed = self._blocks.fold(self._grid, self._steps)
+        met, changed = self.blocks.fold(self._grid, self.steps, stamp_ns)
         dropped = len(points) + len(misses) - hit - missed
         return Delta(hit, missed, dropped, steps + more, met, changed)
 
     def query(self, points_odom: Array) -> Array32:
         """Log-odds (N,) of being occupied at points (N, 3), m; NaN: unknown."""
         steps = self._at(points_odom)
-        return np.where(steps == UNKNOWN, np.nan, steps / self._steps.per_unit).astype(np.float32)
+        return np.where(steps == UNKNOWN, np.nan, steps / self.steps.per_unit).astype(np.float32)
 
     def classify(self, points_odom: Array) -> NDArray[np.uint8]:
         """0 unknown, 1 free, 2 occupied (N,) at points (N, 3), m; what is not finite is unknown."""
@@ -131,23 +142,23 @@ class VoxelMap:
 
     def occupied_centers(self) -> Array:
         """Centres (K, 3) of all occupied voxels, m, in order of the map's growth."""
-        row, cell = np.nonzero(self._blocks.log_odds[: self._blocks.count] >= 0)
+        row, cell = np.nonzero(self.blocks.log_odds[: self.blocks.count] >= 0)
         inside = np.stack([cell >> 6, (cell >> 3) & 7, cell & 7], axis=1)
-        return np.asarray((BLOCK * self._blocks.xyz[row] + inside + 0.5) * self.resolution_m)
+        return np.asarray((BLOCK * self.blocks.xyz[row] + inside + 0.5) * self.resolution_m)
 
     def window(self, block_corner: NDArray[np.int64], states: NDArray[np.uint8]) -> None:
         """Fill `states` (8a, 8b, 8c) with 0 unknown, 1 free, 2 occupied from a block corner on."""
-        self._blocks.window(block_corner, states)
+        self.blocks.window(block_corner, states)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Copies of everything that makes the map, ready for `numpy.savez`."""
-        count = self._blocks.count
+        count = self.blocks.count
         model = self.config.sensor
         return {
             "resolution_m": np.array(self.resolution_m),
             "sensor_model": np.array([model.hit, model.miss, model.lowest, model.highest]),
-            "block_xyz": self._blocks.xyz[:count].copy(),
-            "log_odds": self._blocks.log_odds[:count].copy(),
+            "block_xyz": self.blocks.xyz[:count].copy(),
+            "log_odds": self.blocks.log_odds[:count].copy(),
         }
 
     @classmethod
@@ -162,14 +173,14 @@ class VoxelMap:
         if len(np.unique(xyz, axis=0)) != len(xyz):
             raise InputError("a block is there twice", field="block_xyz")
         voxels = cls(config)
-        voxels._blocks.load(xyz, log_odds, voxels._steps.lowest)
+        voxels.blocks.add(xyz, log_odds, voxels.steps.lowest, held=True)
         return voxels
 
     def _at(self, points_odom: Array) -> NDArray[np.int8]:
         points = np.asarray(points_odom, np.float64).reshape(-1, 3)
         good = np.all(np.abs(points) < 10 * _FARTHEST_M, axis=1)
         cells = np.floor(np.where(good[:, None], points, 0.0) / self.resolution_m).astype(np.int64)
-        return np.where(good, self._blocks.at(cells), np.int8(UNKNOWN))
+        return np.where(good, self.blocks.at(cells), np.int8(UNKNOWN))
 
 
 def _rows(vectors: Array32) -> Array32:
