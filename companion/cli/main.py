@@ -64,6 +64,7 @@ GROUPS = {  # group -> help, command -> module and function
             "bw": "topic:bw",
             "delay": "topic:delay",
             "pub": "topic_pub:pub",
+            "package": "ros:package",
         },
     ),
     "node": ("Look at the nodes on the bus.", {"list": "node:list_nodes", "info": "node:info"}),
