@@ -87,11 +87,16 @@ class BlockStore:
         first, last = self.count, self.count + len(xyz)
         self._reserve(last)
         self._blank(first, last)
-        self.xyz[first:last], self.log_odds[first:last], self.held[first:last] = xyz, log_odds, held
-        self._settled[first:last] = np.packbits(log_odds == lowest, axis=1, bitorder="little").view(np.uint64)
+        self.xyz[first:last], self.held[first:last] = xyz, held
         self.count = last
         enter(self.xyz, first, last, self._keys, self._rows)
-        self.mark_changed(np.arange(first, last))
+        self.write(np.arange(first, last), log_odds, lowest)
+
+    def write(self, rows: NDArray[np.int64], log_odds: NDArray[np.int8], lowest: int) -> None:
+        """Give the blocks in `rows` (K,) other `log_odds` (K, 512); `lowest` is the lower clamp."""
+        self.log_odds[rows] = log_odds
+        self._settled[rows] = np.packbits(log_odds == lowest, axis=1, bitorder="little").view(np.uint64)
+        self.mark_changed(rows)
 
     def remove(self, rows: NDArray[np.int64]) -> None:
         """Forget the blocks in `rows` (K,), each named once; the last rows move into the gaps."""
