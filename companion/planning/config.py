@@ -6,8 +6,8 @@ from typing import Annotated
 
 import msgspec
 
+from companion.planning.registry import PlannerSettings
 from companion.planning.route import RouteConfig
-from companion.planning.rrt_star import RRTStarConfig
 from companion.planning.smooth import SmoothConfig
 from companion.planning.speed_profile import SpeedConfig
 
@@ -15,11 +15,10 @@ Metres = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
-class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class PlanningConfig(PlannerSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Replanning and its algorithms."""
 
     route: RouteConfig = RouteConfig()
-    rrt_star: RRTStarConfig = RRTStarConfig()
     smooth: SmoothConfig = SmoothConfig()
     speed: SpeedConfig = SpeedConfig()
     commit_s: Annotated[float, msgspec.Meta(ge=0)] = 0.15

@@ -15,6 +15,7 @@ from companion.core.messages import Array, Array32, Goal, LocalMap
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import SLOW_M_S, Commitment, Flown, braked, clear_m, commit, with_speeds
 from companion.planning.polyline import cut, length, project, resample, without_repeats
+from companion.planning.registry import make_planner
 from companion.planning.route import Route, RouteFinder, Spaces
 from companion.planning.smooth import smooth
 from companion.planning.space import FieldSpace
@@ -39,7 +40,8 @@ class Replanner:
 
     def __init__(self, config: PlanningConfig, *, hull_radius_m: float, seed: int) -> None:
         self.config, self.hull_radius_m, self._seed = config, hull_radius_m, seed
-        self._finder = RouteFinder(config.route, config.rrt_star, hull_radius_m=hull_radius_m)
+        planner = make_planner(config.route.planner, config)
+        self._finder = RouteFinder(config.route, planner, hull_radius_m=hull_radius_m)
         self.flown: Flown | None = None
         self.goal: Goal | None = None
         self.reached = False

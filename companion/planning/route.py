@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from companion.core.messages import Array, Array32, Limits, LocalMap
+from companion.planning.planner import Plan, Planner, PlannerName
 from companion.planning.polyline import length
-from companion.planning.rrt_star import Plan, RRTStar, RRTStarConfig
 from companion.planning.space import FieldSpace
 from companion.planning.target import place_for
 
@@ -27,6 +27,8 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 class RouteConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How a route is looked for."""
 
+    planner: PlannerName = "rrt_star"
+    """Which planner looks for it."""
     map_margin_m: Metres = 0.1
     """Added to the clearance: cells are coarse."""
     clearance_shares: tuple[Share, ...] = (1.0, 0.75, 0.5)
@@ -34,7 +36,7 @@ class RouteConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     least_clearance_m: Metres = 0.15
     """Hull to obstacle in the map, the least ever planned with."""
     iterations: Count = 1000
-    """Of RRT*, per plan."""
+    """Samples per plan; searches of a lattice need no bound."""
     border_margin_m: Metres = 1.0
     """Stay this far from the border of the local map."""
     substitute_m: Metres = 4.0
@@ -77,11 +79,11 @@ class Spaces:
 
 
 class RouteFinder:
-    """Owns a planner; an answer depends on the arguments alone."""
+    """Asks a planner; an answer depends on the arguments alone."""
 
-    def __init__(self, config: RouteConfig, rrt_star: RRTStarConfig, *, hull_radius_m: float) -> None:
+    def __init__(self, config: RouteConfig, planner: Planner, *, hull_radius_m: float) -> None:
         self.config, self.hull_radius_m = config, hull_radius_m
-        self._planner = RRTStar(rrt_star)
+        self._planner = planner
 
     def radii_m(self, limits: Limits) -> list[float]:
         """Planning radii, widest first."""

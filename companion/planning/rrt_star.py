@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from companion.core.messages import Array
 from companion.planning import connect as two_trees
 from companion.planning import grow, shortcut
+from companion.planning.planner import CellSpace, Plan, refused
 from companion.planning.polyline import length, without_repeats
-from companion.planning.space import FieldSpace
 from companion.planning.tree import COST, NEVER, add, way_to
 
 _PATH_POINTS = 2048
@@ -47,16 +47,6 @@ class RRTStarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Edge of the nearest-neighbour buckets."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Plan:
-    """What a planner found. Unsolved: the way to the reached place nearest to the goal."""
-
-    path: Array  # (N, 3), odom, m
-    cost_m: float  # length; infinite if unsolved
-    iterations: int
-    solved: bool
-
-
 class RRTStar:
     """Keeps only scratch memory, so a plan depends on its arguments alone."""
 
@@ -68,7 +58,7 @@ class RRTStar:
         self,
         start: Array,
         goal: Array,
-        space: FieldSpace,
+        space: CellSpace,
         *,
         rng: np.random.Generator,
         iterations: int,
@@ -80,8 +70,9 @@ class RRTStar:
         old path, need not be valid or fit the ends. With more iterations and the same `rng`
         state the cost never rises.
         """
-        if not (space.contains(start) and space.contains(goal) and space.free(np.stack([start, goal])).all()):
-            return Plan(path=start[None].copy(), cost_m=math.inf, iterations=0, solved=False)
+        refusal = refused(start, goal, space)
+        if refusal is not None:
+            return refusal
         if space.segment_free(start, goal):
             straight = np.stack([start, goal])
             return Plan(path=straight, cost_m=length(straight), iterations=0, solved=True)
@@ -94,7 +85,7 @@ class RRTStar:
             done += self.config.chunk
         return search.result(done)
 
-    def _scratch(self, space: FieldSpace, iterations: int) -> _Memory:
+    def _scratch(self, space: CellSpace, iterations: int) -> _Memory:
         nodes = iterations + self.config.chunk + _SPARE_NODES
         bucket = self.config.bucket_m / space.resolution_m
         shape: NDArray[np.int64] = np.array(space.steps.shape)
@@ -132,7 +123,7 @@ class _Memory:
 class _Search:
     """One run: the tree, the best path so far, and rounds of growing and shortening."""
 
-    def __init__(self, config: RRTStarConfig, space: FieldSpace, memory: _Memory, start: Array, goal: Array) -> None:
+    def __init__(self, config: RRTStarConfig, space: CellSpace, memory: _Memory, start: Array, goal: Array) -> None:
         self._config, self._space, self._memory = config, space, memory
         self._ends = space.to_cells(np.stack([start, goal]))
         self._bucket = config.bucket_m / space.resolution_m

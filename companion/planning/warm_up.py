@@ -7,7 +7,7 @@ import numpy as np
 from companion.core.messages import Limits, LocalMap, freeze
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import with_speeds
-from companion.planning.rrt_star import RRTStar
+from companion.planning.registry import make_planner
 from companion.planning.smooth import smooth
 from companion.planning.space import FieldSpace, fill_ground
 
@@ -19,7 +19,7 @@ def warm_up(config: PlanningConfig, *, hull_radius_m: float) -> None:
     space = FieldSpace(local_map, radius_m=0.2, ground_z=ground, agl_m=(0.0, 9.0))
     start, goal = np.array([1.0, 1.0, 1.0]), np.array([3.0, 1.0, 1.0])
     seed = np.random.default_rng(0)
-    planner = RRTStar(config.rrt_star)
+    planner = make_planner(config.route.planner, config)
     planner.plan(start, goal, space, rng=seed, iterations=500)  # RRT-Connect first
     plan = planner.plan(start, goal, space, rng=seed, iterations=500, known_path=goal[None])
     path = smooth(plan.path, space, config.smooth)

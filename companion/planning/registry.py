@@ -1,0 +1,32 @@
+"""All planners by name.
+
+>>> planner = make_planner("astar", PlannerSettings())
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+
+from companion.core.errors import InputError
+from companion.planning.planner import Planner
+from companion.planning.rrt_star import RRTStar, RRTStarConfig
+
+
+class PlannerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Settings of every planner, also of those that do not fly."""
+
+    rrt_star: RRTStarConfig = RRTStarConfig()
+
+
+PLANNERS: dict[str, Callable[[PlannerSettings], Planner]] = {
+    "rrt_star": lambda settings: RRTStar(settings.rrt_star),
+}
+
+
+def make_planner(name: str, settings: PlannerSettings) -> Planner:
+    """The planner of that name; raises InputError that gives the valid names."""
+    if name not in PLANNERS:
+        raise InputError(f"{name!r} is no planner", field="planner", valid=", ".join(PLANNERS))
+    return PLANNERS[name](settings)
