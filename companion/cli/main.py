@@ -53,7 +53,8 @@ GROUPS = {  # group -> help, command -> module and function
         },
     ),
     "mavlink": ("Look into MAVLink logs.", {"inspect": "mavlink:inspect"}),
-    "bench": ("Measure this machine.", {"bus": "bench:bus"}),
+    "graph": ("Optimise pose graphs.", {"optimise": "graph:optimise_file"}),
+    "bench": ("Measure this machine.", {"bus": "bench:bus", "mapping": "bench_mapping:mapping"}),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",
         {
