@@ -1,0 +1,1 @@
+"""Recognising a place: where was the vehicle, when all it has is what stands around it."""
