@@ -28,9 +28,9 @@ def find_or_make(met, side, corner, table, count, rows):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def enter(xyz, first, last, keys, values):  # type: ignore[no-untyped-def]
-    """Enter the blocks of rows `first` to `last`, none of them there yet."""
-    for row in range(first, last):
+def enter(xyz, rows, keys, values):  # type: ignore[no-untyped-def]
+    """Enter the blocks of `rows`; one that is there already gets its new row."""
+    for row in rows:
         x, y, z = i64(xyz[row, 0]), i64(xyz[row, 1]), i64(xyz[row, 2])
         slot = slot_of(keys, x, y, z)
         keys[slot] = key_of(x, y, z)
@@ -47,17 +47,40 @@ def find(xyz, table, rows):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def leave(xyz, rows, keys, values):  # type: ignore[no-untyped-def]
+    """Take the blocks of `rows` out; what stands behind a gap moves into it if its probing began before."""
+    mask = i64(keys.size - 1)
+    for row in rows:
+        gap = slot_of(keys, i64(xyz[row, 0]), i64(xyz[row, 1]), i64(xyz[row, 2]))
+        slot = (gap + 1) & mask
+        while keys[slot] != EMPTY:
+            other = values[slot]
+            home = _home(mask, i64(xyz[other, 0]), i64(xyz[other, 1]), i64(xyz[other, 2]))
+            if ((slot - home) & mask) >= ((slot - gap) & mask):
+                keys[gap], values[gap] = keys[slot], values[slot]
+                gap = slot
+            slot = (slot + 1) & mask
+        keys[gap] = EMPTY
+
+
+@njit(cache=True, nogil=True)
 def slot_of(keys, x, y, z):  # type: ignore[no-untyped-def]
-    """Where block (x, y, z) is or would go. 2x2x4 neighbours share 16 slots in a row (locality)."""
+    """Where block (x, y, z) is or would go."""
     key = key_of(x, y, z)
     mask = i64(keys.size - 1)
-    h = u64(x >> 1) * u64(0x9E3779B97F4A7C15)
-    h ^= u64(y >> 1) * u64(0xC2B2AE3D27D4EB4F) ^ u64(z >> 2) * u64(0x165667B19E3779F9)
-    h ^= h >> u64(29)
-    slot = (i64((h >> u64(20)) << u64(4)) | ((x & 1) << 3) | ((y & 1) << 2) | (z & 3)) & mask
+    slot = _home(mask, x, y, z)
     while keys[slot] != key and keys[slot] != EMPTY:
         slot = (slot + 1) & mask
     return slot
+
+
+@njit(cache=True, nogil=True)
+def _home(mask, x, y, z):  # type: ignore[no-untyped-def]
+    """Where probing begins. 2x2x4 neighbours share 16 slots in a row (locality)."""
+    h = u64(x >> 1) * u64(0x9E3779B97F4A7C15)
+    h ^= u64(y >> 1) * u64(0xC2B2AE3D27D4EB4F) ^ u64(z >> 2) * u64(0x165667B19E3779F9)
+    h ^= h >> u64(29)
+    return (i64((h >> u64(20)) << u64(4)) | ((x & 1) << 3) | ((y & 1) << 2) | (z & 3)) & mask
 
 
 @njit(cache=True, nogil=True)

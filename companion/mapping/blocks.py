@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from companion.mapping.block_hash import EMPTY, enter, find, find_or_make, slot_of
+from companion.mapping.block_hash import EMPTY, enter, find, find_or_make, leave, slot_of
 from companion.mapping.fold import fold_bits
 from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid
 from companion.mapping.sensor_model import UNKNOWN, Steps
@@ -89,13 +92,28 @@ class BlockStore:
         self._blank(first, last)
         self.xyz[first:last], self.held[first:last] = xyz, held
         self.count = last
-        enter(self.xyz, first, last, self._keys, self._rows)
-        self.write(np.arange(first, last), log_odds, lowest)
+        rows = np.arange(first, last)
+        enter(self.xyz, rows, self._keys, self._rows)
+        self.write(rows, log_odds, lowest)
+
+    def take(self, rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Copies of everything that the blocks in `rows` (K,) hold, by the name of its array."""
+        return {name: getattr(self, name)[rows] for name in _PER_ROW if name != "_settled"}
+
+    def put(self, blocks: Mapping[str, NDArray[Any]], lowest: int) -> None:
+        """Take in blocks as `take` gave them, none of them there; nothing of them has changed."""
+        first, last = self.count, self.count + len(blocks["xyz"])
+        self._reserve(last)
+        for name, array in blocks.items():
+            getattr(self, name)[first:last] = array
+        self._settled[first:last] = _settled(blocks["log_odds"], lowest)
+        self.count = last
+        enter(self.xyz, np.arange(first, last), self._keys, self._rows)
 
     def write(self, rows: NDArray[np.int64], log_odds: NDArray[np.int8], lowest: int) -> None:
         """Give the blocks in `rows` (K,) other `log_odds` (K, 512); `lowest` is the lower clamp."""
         self.log_odds[rows] = log_odds
-        self._settled[rows] = np.packbits(log_odds == lowest, axis=1, bitorder="little").view(np.uint64)
+        self._settled[rows] = _settled(log_odds, lowest)
         self.mark_changed(rows)
 
     def remove(self, rows: NDArray[np.int64]) -> None:
@@ -103,14 +121,14 @@ class BlockStore:
         kept = self.count - len(rows)
         gaps = rows[rows < kept]
         movers = np.setdiff1d(np.arange(kept, self.count), rows, assume_unique=True)
+        leave(self.xyz, rows, self._keys, self._rows)
         for name in _PER_ROW:
             array = getattr(self, name)
             array[gaps] = array[movers]
+        enter(self.xyz, gaps, self._keys, self._rows)
         self.count = kept
         if len(self.xyz) > kept + 2 * _GROWTH:
             self._resize(kept + _GROWTH)
-        self._keys[:] = EMPTY
-        enter(self.xyz, 0, kept, self._keys, self._rows)
 
     def _blank(self, first: int, last: int) -> None:
         """Make rows those of unknown blocks; `xyz` is the caller's matter."""
@@ -125,7 +143,7 @@ class BlockStore:
         if 2 * count > len(self._keys):
             size = 1 << (2 * count - 1).bit_length()
             self._keys, self._rows = np.full(size, EMPTY, np.int64), np.zeros(size, np.int32)
-            enter(self.xyz, 0, self.count, self._keys, self._rows)
+            enter(self.xyz, np.arange(self.count), self._keys, self._rows)
 
     def _resize(self, count: int) -> None:
         """Rows for `count` blocks, in whole slabs."""
@@ -133,6 +151,10 @@ class BlockStore:
         for name in _PER_ROW:
             array = getattr(self, name)
             array.resize((capacity, *array.shape[1:]), refcheck=False)  # realloc: large arrays move without a copy
+
+
+def _settled(log_odds: NDArray[np.int8], lowest: int) -> NDArray[np.uint64]:
+    return np.packbits(log_odds == lowest, axis=1, bitorder="little").view(np.uint64)
 
 
 @njit(cache=True, nogil=True)
