@@ -8,6 +8,7 @@ autopilot decides the next commands.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Final
 
 import msgspec
@@ -96,7 +97,8 @@ class SimNode(Node):
             yield topics.IMU(sample, delay_ns=_ns(late.imu_ms))
         if self._tick % SLOW_TICKS == 0:
             yield topics.BARO(self._baro.sample(now_ns, float(v.p_world[2])), delay_ns=_ns(late.baro_ms))
-            self._ranged = self._range.sample(now_ns, v.p_world, v.q_world_body, self.world.range_to_surface)
+            to_surface = partial(self.world.range_to_surface, stamp_ns=now_ns)
+            self._ranged = self._range.sample(now_ns, v.p_world, v.q_world_body, to_surface)
             yield topics.RANGE(self._ranged, delay_ns=_ns(late.range_ms))
         yield from self._sweep(now_ns, _ns(late.lidar_ms))
         stamp_ns = round((self._frames + 1) * 1e9 / self.config.camera.rate_hz)
@@ -185,6 +187,7 @@ def _obstacles(world: World) -> Obstacles:
         heights=world.heights,
         origin_xy=world.origin_xy,
         cell_m=world.cell_m,
+        walkers=world.walkers,
     )
 
 

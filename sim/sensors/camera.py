@@ -2,8 +2,8 @@
 
 A first cast through every second pixel corner finds depth; where the four corners of a
 2 x 2 block lie on one surface its depth is interpolated (1/depth is linear on a plane), else
-each pixel casts its own ray, so that thin things have true edges. Not modelled: lens
-distortion, rolling shutter, shadows, motion blur.
+each pixel casts its own ray, so that thin things have true edges. Walkers cover the pixels whose
+own rays meet them. Not modelled: lens distortion, rolling shutter, shadows, motion blur.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from companion.core.messages import Array, Array32, CameraImage, freeze
 from companion.core.rig import Mount, Pinhole
 from sim.sensors.caster import Caster
 from sim.sensors.texture import _sample, load_tile, mip_levels
+from sim.sensors.walker_rays import WalkerRays
 from sim.world.mesh import GROUND, TRUNK, Mesh
+from sim.world.walkers import NOBODY, Walkers
 
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 _STREAM = 2  # of the random numbers
@@ -28,6 +30,7 @@ _STEP = 2  # px between the corners of the first cast
 _LIGHT = (0.35, 0.25, 0.9)  # direction to the sky's bright side; need not be unit
 _CENTER_PX = 512.0  # of the photograph, over the world's origin
 _SKY, _BARK = 235.0, 0.55  # grey of the sky; bark against the ground's picture
+_COAT = np.float32(1.3)  # brightness of walkers
 
 
 class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -44,12 +47,22 @@ class Camera:
     """Renders frames; every frame depends on its pose, the seed and its counter alone."""
 
     def __init__(
-        self, config: CameraConfig, mount: Mount, pinhole: Pinhole, *, caster: Caster, mesh: Mesh, seed: int
+        self,
+        config: CameraConfig,
+        mount: Mount,
+        pinhole: Pinhole,
+        *,
+        caster: Caster,
+        mesh: Mesh,
+        seed: int,
+        walkers: Walkers = NOBODY,
     ) -> None:
         self.config, self.pinhole = config, pinhole
         self._p_body, self._R_body_cam = mount.p_body, mount.R_body_sensor
         self._caster, self._seed = caster, seed
-        self._classes, self._shade = mesh.classes.copy(), _shade_of(mesh)
+        self._classes = np.append(mesh.classes, np.uint8(TRUNK))  # the last is that of the walkers
+        self._shade = np.append(_shade_of(mesh), _COAT)
+        self._walkers = WalkerRays(walkers, mark=len(mesh.classes))
         self._flat, self._starts = mip_levels(load_tile())
         self._vignette = _vignette(pinhole, config.vignetting)
         width, height = pinhole.width_px, pinhole.height_px
@@ -64,6 +77,7 @@ class Camera:
         R_world_body = rotation_from_quaternion(q_world_body)
         R, p = R_world_body @ self._R_body_cam, p_world + R_world_body @ self._p_body
         depth, triangle = self._surfaces(R, p)
+        self._walkers.cover_picture((self._pixel_dirs, R, p), stamp_ns * 1e-9, depth, triangle)
         shape = self._pixel_dirs.shape[:2]
         noise = np.random.default_rng([self._seed, _STREAM, counter]).standard_normal(shape, dtype=np.float32)
         noise *= np.float32(c.noise_sigma)

@@ -2,6 +2,7 @@
 
 A thin branch fills only a part of the beam, `coverage` = width / (divergence * range); it
 returns with probability min(1, coverage)^2, else the beam goes on to what stands behind.
+Walkers cover what is behind them where they are at the time of each beam.
 A beam that met nothing within `range_max_m` is a miss; a beam that was lost (drop-out, own
 body, too near, fault) is neither a point nor a miss. Not modelled: mixed pixels, intensity,
 multiple reflections, rain.
@@ -20,7 +21,9 @@ from companion.core.messages import Array, Array32, LidarScan, freeze
 from companion.core.rig import Mount
 from sim.sensors.caster import Caster
 from sim.sensors.patterns import rosette_pattern, spin_pattern
+from sim.sensors.walker_rays import WalkerRays
 from sim.world.mesh import Mesh
+from sim.world.walkers import NOBODY, Walkers
 
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -70,10 +73,14 @@ def knot_stamps(
 class Lidar:
     """Renders sweeps; every sweep depends on its poses, the seed and its counter alone."""
 
-    def __init__(self, config: LidarConfig, mount: Mount, caster: Caster, mesh: Mesh, seed: int) -> None:
+    def __init__(
+        self, config: LidarConfig, mount: Mount, caster: Caster, mesh: Mesh, seed: int, *, walkers: Walkers = NOBODY
+    ) -> None:
         self.config = config
         self._p_body, self._R_body_sensor = mount.p_body, mount.R_body_sensor
-        self._caster, self._widths_m, self._seed = caster, mesh.widths_m.copy(), seed
+        self._caster, self._seed = caster, seed
+        self._widths_m = np.append(mesh.widths_m, np.float32(np.inf))  # the last is that of the walkers
+        self._walkers = WalkerRays(walkers, mark=len(mesh.widths_m))
         nothing = np.empty((0, 3), np.float32)
         self._rosette: tuple[int, tuple[Array32, Array32]] = (-1, (nothing, nothing[:, 0]))
         if config.pattern == "spin64":
@@ -109,7 +116,9 @@ class Lidar:
         knots = np.array(p_world, np.float64), np.array(q_world_body, np.float64)
         _aim(dirs, phases * np.float32(parts) - np.float32(part), *knots, mount, rays, seen)
         ranges, triangles = self._cast(rays, dirs)
-        self._through_thin(rays, ranges, triangles, uniform)
+        walkers_m = self._walkers.distances(rays, stamp_ns * 1e-9 + c.sweep_s * (phases.astype(np.float64) - 1.0))
+        self._walkers.cover(ranges, triangles, walkers_m)
+        self._through_thin(rays, ranges, triangles, uniform, walkers_m)
         loss = 1.0 - (1.0 - c.dropout) * (1.0 - lost_fraction)
         _disturb(ranges, seen, uniform, (loss, dust_fraction, c.range_min_m, c.range_max_m))
         noise = (c.range_sigma_m, c.range_sigma_per_m, np.radians(c.angle_sigma_deg), c.range_max_m)
@@ -140,11 +149,14 @@ class Lidar:
         ranges[order], triangles[order] = far, ids
         return ranges, triangles
 
-    def _through_thin(self, rays: Array32, ranges: Array32, triangles: NDArray[np.uint32], uniform: Array32) -> None:
+    def _through_thin(
+        self, rays: Array32, ranges: Array32, triangles: NDArray[np.uint32], uniform: Array32, far: Array32 | None
+    ) -> None:
         """Let beams that a thin thing did not return go on to what stands behind it, in place."""
         divergence = 1e-3 * self.config.divergence_mrad
         passing, onward, gone = _weak(rays, ranges, triangles, self._widths_m, uniform, divergence)
         behind, again = self._caster.cast(onward)
+        self._walkers.cover(behind, again, None if far is None else far[passing] - gone)
         _behind(passing, gone, behind, again, self._widths_m, uniform, divergence, ranges)
 
 

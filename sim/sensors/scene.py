@@ -14,6 +14,7 @@ from sim.sensors.camera import Camera, CameraConfig
 from sim.sensors.caster import Caster
 from sim.sensors.lidar import Lidar, LidarConfig
 from sim.world.mesh import Mesh
+from sim.world.walkers import NOBODY, Walkers
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class RenderSetup:
     camera: CameraConfig
     rig: Rig
     seed: int
+    walkers: Walkers = NOBODY
 
     @property
     def message_bytes(self) -> int:
@@ -37,10 +39,12 @@ class Sensors:
     """The models over one mesh."""
 
     def __init__(self, setup: RenderSetup) -> None:
-        mesh, rig = setup.mesh, setup.rig
+        mesh, rig, walkers = setup.mesh, setup.rig, setup.walkers
         caster = Caster(mesh)
-        self.lidar = Lidar(setup.lidar, rig.lidar, caster, mesh, setup.seed)
-        self.camera = Camera(setup.camera, rig.camera, rig.pinhole, caster=caster, mesh=mesh, seed=setup.seed)
+        self.lidar = Lidar(setup.lidar, rig.lidar, caster, mesh, setup.seed, walkers=walkers)
+        self.camera = Camera(
+            setup.camera, rig.camera, rig.pinhole, caster=caster, mesh=mesh, seed=setup.seed, walkers=walkers
+        )
 
     def render(self, kind: str, request: dict[str, Any]) -> tuple[LidarScan | CameraImage, float]:
         """One message of kind `lidar` or `camera`, and the CPU seconds that it took."""

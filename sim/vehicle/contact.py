@@ -1,4 +1,4 @@
-"""Hull against trunks, branches and ground: signed clearances at the physics rate.
+"""Hull against trunks, branches, walkers and ground: signed clearances at the physics rate.
 
 The hull is a set of spheres; trunks and branches are solid cone frusta, the ground a height
 field. Cones near the aircraft are kept in a list that is made anew from a grid only after it
@@ -18,10 +18,11 @@ from companion.core.errors import InputError
 from companion.core.messages import Array
 from sim.world.reach import ConeGrid, grid_of
 from sim.world.terrain import _height
+from sim.world.walkers import NOBODY, Walkers, feet_of
 
 REACH_M = 4.0  # clearances are measured up to here; "nothing within reach" reads as this
 _SKIN_M = 1.0
-CONTACTS = ("", "trunk", "branch", "ground")
+CONTACTS = ("", "trunk", "branch", "ground", "walker")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,7 @@ class Obstacles:
     heights: Array  # (nx, ny), ground at origin_xy + (i, j) * cell_m
     origin_xy: Array  # (2,)
     cell_m: float
+    walkers: Walkers = NOBODY
 
     def __post_init__(self) -> None:
         if self.cones.ndim != 2 or self.cones.shape[1] != 9 or len(self.kinds) != len(self.cones):
@@ -116,6 +118,28 @@ def _cone_clearance(x, spheres, cones, kinds, frame, start, items, near, seen, b
                 if gap <= 0.0:
                     kind = 1 + kinds[near[k]]
     return best, kind
+
+
+@njit(cache=True, nogil=True)
+def _walker_clearance(x, spheres, walkers, time_s, best):  # type: ignore[no-untyped-def]
+    """Lowers `best` if a walker is nearer at that time; also whether one is touched."""
+    tracks, rows, traits = walkers
+    reach = _hull_reach(spheres)
+    touched = False
+    cylinder = np.zeros(9)
+    cylinder[5] = 1.0
+    for k in range(rows.shape[0]):
+        feet = feet_of(tracks, rows, traits, k, time_s)
+        cylinder[0], cylinder[1], cylinder[2] = feet
+        cylinder[6], cylinder[7], cylinder[8] = traits[k, 4], traits[k, 3], traits[k, 3]
+        if _axis_distance(cylinder, x[0], x[1], x[2]) - traits[k, 3] - reach >= best:
+            continue
+        for s in range(spheres.shape[0]):
+            px, py, pz = _to_world(x, spheres[s])
+            gap = _frustum_distance(cylinder, px, py, pz) - spheres[s, 3]
+            best = min(best, gap)
+            touched = touched or gap <= 0.0
+    return best, touched
 
 
 @njit(cache=True, nogil=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from companion.core.messages import Array
 from sim.world.mesh import Mesh
 from sim.world.reach import ConeGrid, first_hit
 from sim.world.terrain import heights_at
+from sim.world.walkers import NOBODY, Walkers
 
 TRUNK_CONE, BRANCH_CONE = 0, 1
 
@@ -44,6 +46,7 @@ class World:
     cell_m: float
     mesh: Mesh
     grid: ConeGrid  # which cones touch which square metre
+    walkers: Walkers = NOBODY  # what moves; everything else stands still
 
     def ground_z(self, x: Array | float, y: Array | float) -> Array:
         """Ground height, m, in the shape of x and y; beyond the field that of its rim."""
@@ -51,6 +54,15 @@ class World:
         xy = np.stack([xs.ravel(), ys.ravel()], axis=1)
         return heights_at(self.heights, self.origin_xy, self.cell_m, xy).reshape(xs.shape)
 
-    def range_to_surface(self, p_world: Array, direction: Array, *, max_range_m: float = 60.0) -> float:
-        """Distance from p along a unit direction to ground, trunk or branch; inf: none in range."""
-        return first_hit(self, p_world, direction, max_range_m)
+    def range_to_surface(
+        self, p_world: Array, direction: Array, *, max_range_m: float = 60.0, stamp_ns: int | None = None
+    ) -> float:
+        """Distance from p along a unit direction to ground, trunk or branch; inf: none in range.
+
+        With `stamp_ns` the walkers count, too, where they are at that time.
+        """
+        still_m = first_hit(self, p_world, direction, max_range_m)
+        if stamp_ns is None or not len(self.walkers):
+            return still_m
+        walker_m = self.walkers.first_hit(p_world, direction, stamp_ns)
+        return min(still_m, walker_m if walker_m <= max_range_m else math.inf)

@@ -33,6 +33,15 @@ class EmptySpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     roughness_length_m: Positive = 6.0  # size of the bumps
     start_m: tuple[float, float] | None = None  # in the map's coordinates; None: most open near the centre
     clearing_m: NotNegative = 2.0  # free radius around the start
+    walkers: Annotated[int, msgspec.Meta(ge=0, le=100)] = 0  # upright cylinders on drawn ways, to and fro
+    walker_paths: tuple[Annotated[tuple[tuple[float, float], ...], msgspec.Meta(min_length=2)], ...] = ()
+    """Corners, m from the start, of the ways of further walkers."""
+    walker_speed_m_s: tuple[Positive, Positive] = (0.5, 2.0)  # drawn once for each
+    walker_radius_m: Positive = 0.3
+    walker_height_m: Positive = 1.8
+    walker_reach_m: Annotated[float, msgspec.Meta(ge=6, le=250)] = 20.0  # drawn ways lie so near to the start in x, y
+    walker_turns: Annotated[int, msgspec.Meta(ge=0, le=10)] = 1  # corners of a drawn way between its ends
+    walker_start_gap_m: NotNegative = 3.0  # how far they keep off the start
 
 
 class TreesSpec(EmptySpec, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -83,7 +92,7 @@ def parse_spec(values: Mapping[str, object], *, file: str = "") -> WorldSpec:
         spec: WorldSpec = msgspec.convert(dict(values), WorldSpec)
     except msgspec.ValidationError as error:
         raise _readable(error, KINDS[kind], file) from None
-    for name in ("branch_length_m", "branch_diameter_m", "branch_height_m"):
+    for name in ("branch_length_m", "branch_diameter_m", "branch_height_m", "walker_speed_m_s"):
         low, high = getattr(spec, name, (0.0, 0.0))
         if low > high:
             raise InputError(f"{low} exceeds {high}", file=file, field=name, valid="low, high")

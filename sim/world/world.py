@@ -17,11 +17,12 @@ from sim.world.reach import grid_of
 from sim.world.spec import EmptySpec, PoissonSpec, StemsSpec, TreesSpec, WorldSpec, parse_spec
 from sim.world.stems import read_stems
 from sim.world.terrain import heights_at, make_heights
+from sim.world.walkers import make_walkers
 
 __all__ = ["World", "build_world", "load_world", "read_spec"]
 
 WORLDS_DIR = Path(__file__).resolve().parents[2] / "configs" / "worlds"
-_STREAMS = ("stems", "terrain", "heights", "lean", "branches", "leaves")
+_STREAMS = ("stems", "terrain", "heights", "lean", "branches", "leaves", "walkers")
 
 
 def load_world(value: str, *, seed: int, options: Mapping[str, object] | None = None) -> World:
@@ -87,6 +88,13 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
     z = heights_at(heights, origin, spec.cell_m, xy)
     stems = Stems(xy[:, 0].copy(), xy[:, 1].copy(), z, dbh_m, height_m)
     cones, kinds, leafy = _trees(spec, stems, streams)
+    walkers = make_walkers(
+        spec,
+        np.column_stack([xy, dbh_m / 2]),
+        (low, high),
+        lambda points: heights_at(heights, origin, spec.cell_m, points),
+        streams["walkers"],
+    )
     parts = [ground_mesh(heights, origin, spec.cell_m), *leafy]
     return _frozen(
         World(
@@ -101,6 +109,7 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
             cell_m=spec.cell_m,
             mesh=assemble(parts),
             grid=grid_of(cones),
+            walkers=walkers,
         )
     )
 
@@ -170,7 +179,7 @@ def _clear_of_start(branches: Array, radius_m: float) -> np.ndarray:
 
 
 def _frozen(world: World) -> World:
-    for holder in (world, world.stems, world.mesh, world.grid):
+    for holder in (world, world.stems, world.mesh, world.grid, world.walkers):
         for value in vars(holder).values():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
