@@ -176,6 +176,28 @@ class MapStatus:
     blocks: int  # of 8 x 8 x 8 voxels, alive
 
 
+@message
+class OccupiedVoxels:
+    """The map as a viewer wants it."""
+
+    stamp_ns: int  # of the newest scan inside
+    points_odom: Array32  # centres of the occupied voxels, m, (N, 3)
+    log_odds: Array32  # of being occupied, (N,)
+
+
+@message
+class MapDelta:
+    """Blocks of 8 x 8 x 8 voxels whose classes changed; `companion.mapping.mirror` keeps a map by it."""
+
+    stamp_ns: int  # of the newest scan inside
+    map_ns: int  # stamp of the map's first scan: a map that begins anew counts versions anew
+    version_from: int  # every block changed after this version is inside; 0: the whole map
+    version_to: int
+    resolution_m: float
+    block_count: int
+    data: bytes  # zlib of one record of 140 bytes per block, as in MapDelta.msg
+
+
 # --- mission ------------------------------------------------------------------------
 
 

@@ -17,7 +17,7 @@ M_co = TypeVar("M_co", covariant=True)
 N = TypeVar("N", bound="Node")
 
 Keep = Literal["all", "latest"]
-Service = Literal["control", "state", "bulk", "latched"]
+Service = Literal["control", "state", "bulk", "latched", "history"]
 
 
 class Pending(Protocol[M_co]):
@@ -48,7 +48,8 @@ class Topic(Generic[M]):
     `rate_hz` is the expected rate (0: on change); a periodic topic is stale when it was
     silent for `deadline_s`. `keep` says whether a busy subscriber gets every message or
     only the newest; `recorded` whether the flight log stores it. `service` is how a bus treats
-    it: `control` before all else, `state`, `bulk` behind the others, `latched` for late joiners.
+    it: `control` before all else, `state`, `bulk` behind the others, `latched` for late joiners,
+    `history` for late joiners, too, but behind the others and, where `keep` is "all", more than the newest.
     `ros_type` is the standard ROS 2 type that carries it; if none fits without loss, our own.
     """
 

@@ -44,6 +44,16 @@ SMOOTHED = Topic("estimation/smoothed", m.SmoothedState, 10.0)
 # mapping
 LOCAL_MAP = Topic("mapping/local_map", m.LocalMap, 5.0, recorded=False, deadline_s=1.0, service="bulk")
 MAP_STATUS = Topic("mapping/status", m.MapStatus, 5.0, deadline_s=1.0)
+OCCUPIED = Topic(
+    "mapping/occupied",
+    m.OccupiedVoxels,
+    0.0,  # 2 Hz at most, when the map changed
+    recorded=False,
+    service="history",
+    ros_type="sensor_msgs/msg/PointCloud2",
+)
+MAP_DELTA = Topic("mapping/delta", m.MapDelta, 0.0, "all", recorded=False, service="history")
+MAP_FULL = Topic("mapping/full", m.MapDelta, 0.0, recorded=False, service="history")
 # mission
 GOAL = Topic("mission/goal", m.Goal, 0.0, service="latched")  # a planner that starts again needs it
 VEHICLE_COMMAND = Topic("mission/vehicle_command", m.VehicleCommand, 0.0, "all", service="control")

@@ -11,9 +11,10 @@ from companion.core.geometry import rotation_from_quaternion
 from companion.core.messages import Array, MapStatus, RegisteredScan
 from companion.core.node import Node, Outputs, on
 from companion.core.rig import Rig
-from companion.core.topics import LOCAL_MAP, MAP_STATUS, REGISTERED
+from companion.core.topics import LOCAL_MAP, MAP_DELTA, MAP_FULL, MAP_STATUS, OCCUPIED, REGISTERED
 from companion.mapping.distance_field import DistanceField, FieldConfig
 from companion.mapping.free_volume import cells_around
+from companion.mapping.share import MapShare, ShareConfig, warm_share
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 
 _Metres = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
@@ -24,6 +25,7 @@ class MappingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     voxels: VoxelMapConfig = VoxelMapConfig()
     field: FieldConfig = FieldConfig()
+    share: ShareConfig = ShareConfig()
     map_every: Annotated[int, msgspec.Meta(ge=1)] = 2  # scans per local map
     own_radius_m: _Metres = 0.35  # returns nearer to the body's origin are the vehicle itself
     start_free_radius_m: _Metres = 0.7  # sphere that is free at the first scan: nothing touches the rotors
@@ -33,13 +35,13 @@ class MappingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class MappingNode(Node):
-    """Takes in every registered scan; publishes the local map after every `map_every`-th.
+    """Takes in every registered scan; publishes the local map after every `map_every`-th, the rest as `share` has it.
 
     `voxels` is the map, for saving at the end of a flight. `skipped_pose` and `skipped_stamp`
     count scans that were left out: pose not finite, stamp not newer than the last.
     """
 
-    publishes = (LOCAL_MAP, MAP_STATUS)
+    publishes = (LOCAL_MAP, MAP_STATUS, OCCUPIED, MAP_DELTA, MAP_FULL)
 
     def __init__(self, config: MappingConfig, rig: Rig, *, hull_radius_m: float) -> None:
         self.config = config
@@ -48,6 +50,7 @@ class MappingNode(Node):
         self.voxels = VoxelMap(config.voxels)
         self.scans = self.skipped_pose = self.skipped_stamp = 0
         self._field = DistanceField(config.field, resolution_m=config.voxels.resolution_m)
+        self._share = MapShare(config.share)
         self._newest_ns = -1
         self._compile()
 
@@ -76,6 +79,7 @@ class MappingNode(Node):
             yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
             yield MAP_STATUS(MapStatus(stamp_ns=scan.stamp_ns, scans=self.scans + 1, blocks=self.voxels.block_count))
         self.scans += 1
+        yield from self._share.after_scan(self.voxels, scan.p_odom, stamp_ns=scan.stamp_ns)
 
     def _filled_by_vehicle(self, p_odom: Array) -> Array:
         """Centres (K, 3) of the cells that are free because the vehicle is, or starts, there."""
@@ -90,6 +94,7 @@ class MappingNode(Node):
         zero = np.zeros(3)
         self.voxels.insert(np.empty((0, 3), np.float32), R_odom_body=np.eye(3), p_odom=zero, origin_odom=zero)
         self._field.around(self.voxels, zero, 0)
+        warm_share(self.voxels)
 
 
 def _usable(scan: RegisteredScan) -> bool:

@@ -25,6 +25,7 @@ URGENCY: dict[Service, Urgency] = {
     "state": Urgency(zenoh.Priority.INTERACTIVE_HIGH, express=True),
     "bulk": Urgency(zenoh.Priority.DATA_LOW),
     "latched": Urgency(zenoh.Priority.INTERACTIVE_HIGH),
+    "history": Urgency(zenoh.Priority.DATA_LOW),
 }
 
 

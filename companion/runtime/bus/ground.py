@@ -34,6 +34,7 @@ RATES_HZ = {  # most per second on the ground link; other topics pass whole
     "estimation/registered_scan": 1.0,
     "estimation/odometry": 10.0,
     "mapping/local_map": 0.5,
+    "mapping/occupied": 0.5,
     "tracking/setpoint": 10.0,
     "safety/status": 5.0,
     "truth": 10.0,

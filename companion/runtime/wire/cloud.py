@@ -18,6 +18,7 @@ Without a time field the age is 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from companion.runtime.wire.parts import header_of, stamp_of
 
 FIELDS = ("x", "y", "z", "age_s", "beam_x", "beam_y", "beam_z")
 TIME_FIELDS = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset")
+_WANTED = (*FIELDS, *TIME_FIELDS)
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField
 _FLOAT32 = 7
 _POINT_BYTES = 4 * len(FIELDS)
@@ -62,14 +64,14 @@ def cloud_of(scan: LidarScan) -> dict[str, Any]:
 def scan_of(cloud: dict[str, Any]) -> LidarScan:
     """LidarScan of any PointCloud2 with x, y and z."""
     stamp_ns = stamp_of(cloud["header"])
-    points = _table(cloud)
+    points = point_table(cloud, _WANTED)
     names = points.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise WireError(f"a cloud without x, y, z (fields: {', '.join(names) or 'none'})")
     if set(FIELDS) <= set(names):
-        own = points.view("<f4").reshape(-1, len(FIELDS)) if points.dtype == _OWN else _columns(points, *FIELDS)
+        own = points.view("<f4").reshape(-1, len(FIELDS)) if points.dtype == _OWN else columns(points, *FIELDS)
         return _own(stamp_ns, own)
-    xyz = _columns(points, "x", "y", "z")
+    xyz = columns(points, "x", "y", "z")
     kept = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
     age_s, newest_ns = _ages(points[kept], stamp_ns)
     none = np.empty((0, 3), np.float32)
@@ -97,11 +99,11 @@ def _scan(stamp_ns: int, points: Array32, age_s: Array32, misses: Array32, miss_
     return scan
 
 
-def _table(cloud: dict[str, Any]) -> np.ndarray[Any, Any]:
-    """The points as a struct array of the fields that are asked for, in rows."""
+def point_table(cloud: dict[str, Any], wanted: Sequence[str]) -> np.ndarray[Any, Any]:
+    """The points as a struct array (N,) of those fields of `wanted` that the cloud has; WireError if it is none."""
     height, width = cloud["height"], cloud["width"]
     step, row = cloud["point_step"], cloud["row_step"]
-    dtype = _point_dtype(cloud["fields"], step, ">" if cloud["is_bigendian"] else "<")
+    dtype = _point_dtype(cloud["fields"], wanted, step, ">" if cloud["is_bigendian"] else "<")
     data = cloud["data"]
     if height == 0 or width == 0:
         return np.empty(0, dtype)
@@ -113,8 +115,7 @@ def _table(cloud: dict[str, Any]) -> np.ndarray[Any, Any]:
     return np.ascontiguousarray(rows).reshape(-1).view(dtype)
 
 
-def _point_dtype(fields: list[dict[str, Any]], step: int, order: str) -> np.dtype[Any]:
-    wanted = {*FIELDS, *TIME_FIELDS}
+def _point_dtype(fields: list[dict[str, Any]], wanted: Sequence[str], step: int, order: str) -> np.dtype[Any]:
     names, formats, offsets = [], [], []
     for field in fields:
         name, code = field["name"], _DTYPES.get(field["datatype"])
@@ -134,7 +135,8 @@ def _point_dtype(fields: list[dict[str, Any]], step: int, order: str) -> np.dtyp
     return dtype
 
 
-def _columns(points: np.ndarray[Any, Any], *names: str) -> Array32:
+def columns(points: np.ndarray[Any, Any], *names: str) -> Array32:
+    """Some fields of a point table, (N, K)."""
     out = np.empty((len(points), len(names)), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         for i, name in enumerate(names):
@@ -146,7 +148,7 @@ def _ages(points: np.ndarray[Any, Any], stamp_ns: int) -> tuple[Array32, int]:
     """Age of each point before the newest, s, and how far the newest is behind the stamp, ns."""
     names = points.dtype.names or ()
     if "age_s" in names:
-        age_s = np.nan_to_num(np.maximum(_columns(points, "age_s")[:, 0], 0), nan=0.0, posinf=0.0)
+        age_s = np.nan_to_num(np.maximum(columns(points, "age_s")[:, 0], 0), nan=0.0, posinf=0.0)
         return age_s, 0
     name = next((n for n in TIME_FIELDS if n in names), None)
     if name is None or not len(points):

@@ -7,7 +7,7 @@ from typing import Any
 from companion.core import messages as m
 from companion.core.errors import InputError
 from companion.core.node import Topic
-from companion.runtime.wire import cloud, own, standard
+from companion.runtime.wire import cloud, own, standard, voxel_cloud
 from companion.runtime.wire.cdr_read import MALFORMED
 from companion.runtime.wire.errors import WireError
 from companion.runtime.wire.own import FromValue, ToValue
@@ -16,6 +16,7 @@ from companion.runtime.wire.types import Payload, WireType, wire_type
 _STANDARD: dict[tuple[type[Any], str], tuple[ToValue, FromValue]] = {
     (m.ImuSample, "sensor_msgs/msg/Imu"): (standard.imu_value, standard.imu_sample),
     (m.LidarScan, "sensor_msgs/msg/PointCloud2"): (cloud.cloud_of, cloud.scan_of),
+    (m.OccupiedVoxels, "sensor_msgs/msg/PointCloud2"): (voxel_cloud.cloud_of, voxel_cloud.voxels_of),
     (m.CameraImage, "sensor_msgs/msg/Image"): (standard.image_value, standard.camera_image),
     (m.RangeReading, "sensor_msgs/msg/Range"): (standard.range_value, standard.range_reading),
     (m.BaroReading, "sensor_msgs/msg/FluidPressure"): (standard.pressure_value, standard.baro_reading),

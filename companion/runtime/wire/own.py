@@ -22,8 +22,8 @@ from companion.runtime.wire.types import WireType
 
 PACKAGE = "understory_msgs"
 FRAMES: dict[type[Any], str] = {  # header.frame_id, where there is one
-    **dict.fromkeys((m.LioState, m.PoseLikelihood, m.Odometry, m.LocalMap, m.Goal, m.VehicleStatus), "odom"),
-    **dict.fromkeys((m.Trajectory, m.PlanStatus, m.Setpoint), "odom"),
+    **dict.fromkeys((m.LioState, m.PoseLikelihood, m.Odometry, m.LocalMap, m.MapDelta, m.Goal), "odom"),
+    **dict.fromkeys((m.Trajectory, m.PlanStatus, m.Setpoint, m.VehicleStatus), "odom"),
     m.RegisteredScan: "base_link",
     m.SmoothedState: "map",
     m.GroundTruth: "world",

@@ -10,6 +10,7 @@ from companion.runtime.wire.errors import WireError
 
 _DEFAULT_DEPTH = 42  # rmw_zenoh's own; it stands for empty in the token
 _MAX_NS = 2**63 - 1
+HISTORY_DEPTH = 256  # samples for who comes late: two minutes of map deltas
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,8 @@ def qos_of(topic: Topic[Any]) -> Qos:
         return Qos(reliable=False, depth=5)  # sensor data
     if topic.service == "latched":
         return Qos(transient_local=True, depth=1)
+    if topic.service == "history":
+        return Qos(transient_local=True, depth=1 if topic.keep == "latest" else HISTORY_DEPTH)
     return Qos(depth=1 if topic.keep == "latest" else 10)
 
 
