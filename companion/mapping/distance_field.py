@@ -79,12 +79,16 @@ class DistanceField:
             origin_odom=corner * edge_m,
             resolution_m=self.resolution_m,
             state=states,
-            distance_m=self._distances(states, _NEAREST_OCCUPIED),
+            distance_m=self.distance_to_occupied(states),
             unknown_distance_m=self._distances(states, _NEAREST_NOT_FREE),
             ground_z_odom=self._ground(states, corner[2] * edge_m),
         )
         freeze(snapshot)
         return snapshot
+
+    def distance_to_occupied(self, states: NDArray[np.uint8]) -> Array32:
+        """Distance (X, Y, Z) of each cell of a box of `shape` to the nearest occupied one, m, as in `around`."""
+        return self._distances(states, _NEAREST_OCCUPIED)
 
     def _distances(self, states: NDArray[np.uint8], chosen: tuple[int, int]) -> Array32:
         out = np.empty(states.shape, np.float32)

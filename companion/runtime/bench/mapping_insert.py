@@ -1,0 +1,82 @@
+"""Insertion beside OctoMap: CPU time per scan, and how far the two maps agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.core.messages import Array
+from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from companion.runtime.bench.mapping_peers import OCTOMAP_MODEL, OctoMap, cpu_ms
+from companion.runtime.bench.mapping_scans import Scan
+
+RANGE_M = 30.0
+_OURS = 3  # maps of ours beside each tree: milliseconds are disturbed more easily than seconds
+_BLOCKS = 512  # blocks of voxels asked for at once
+_NEAR = np.array(list(product((-1, 0, 1), repeat=3)))
+
+
+def like_octomap(resolution_m: float) -> VoxelMapConfig:
+    """Our map with OctoMap's sensor model."""
+    return VoxelMapConfig(resolution_m=resolution_m, max_range_m=RANGE_M, sensor=OCTOMAP_MODEL)
+
+
+def time_insertion(scans: list[Scan], resolution_m: float, *, rounds: int) -> dict[str, float]:
+    """CPU ms per scan of both, interleaved; the first scan, which fills an empty map, stands apart.
+
+    Each round fills new maps. Of each scan the smallest time over the rounds counts, then the mean over the scans.
+    """
+    ours, theirs = np.full(len(scans), np.inf), np.full(len(scans), np.inf)
+    for _ in range(rounds):
+        maps = [VoxelMap(like_octomap(resolution_m)) for _ in range(_OURS)]
+        tree = OctoMap(resolution_m, RANGE_M)
+        for k, scan in enumerate(scans):
+            taken = [cpu_ms(partial(scan.into, voxels)) for voxels in maps]
+            ours[k] = min(ours[k], *taken)
+            theirs[k] = min(theirs[k], cpu_ms(tree.insertion(scan)))
+    return {
+        "ours_ms": float(ours[1:].mean()),
+        "peer_ms": float(theirs[1:].mean()),
+        "first_ours_ms": float(ours[0]),
+        "first_peer_ms": float(theirs[0]),
+        "returns": float(np.mean([len(s.points_body) for s in scans[1:]])),
+    }
+
+
+def agreement(scans: Iterable[Scan], resolution_m: float) -> dict[str, float]:
+    """Both maps after all scans, over the voxels that either knows.
+
+    `agreement`: same class; `free_recall`, `occupied_recall`: share of OctoMap's that are ours,
+    too; `occupied_precision`: share of our occupied that are occupied in OctoMap.
+    """
+    voxels, tree, count = VoxelMap(like_octomap(resolution_m)), OctoMap(resolution_m, RANGE_M), 0
+    for scan in scans:
+        scan.into(voxels)
+        tree.insertion(scan)()
+        count += 1
+    pairs = np.zeros((3, 3), np.int64)  # their class, our class
+    for centers in _centers(voxels):
+        pairs += np.bincount(3 * tree.classes(centers) + voxels.classify(centers), minlength=9).reshape(3, 3)
+    known = pairs.sum() - pairs[0, 0]
+    return {
+        "agreement": float((pairs[1, 1] + pairs[2, 2]) / known),
+        "free_recall": float(pairs[1, 1] / pairs[1].sum()),
+        "occupied_recall": float(pairs[2, 2] / pairs[2].sum()),
+        "occupied_precision": float(pairs[2, 2] / pairs[:, 2].sum()),
+        "known_voxels": float(known),
+        "scans": float(count),
+    }
+
+
+def _centers(voxels: VoxelMap) -> Iterator[Array]:
+    """Centres of all voxels of our blocks and of the blocks around them, where rays may differ."""
+    xyz: NDArray[np.int32] = voxels.to_arrays()["block_xyz"]
+    blocks = np.unique((xyz[:, None] + _NEAR).reshape(-1, 3), axis=0)
+    inside = np.array(list(product(range(8), repeat=3))) + 0.5
+    for first in range(0, len(blocks), _BLOCKS):
+        cells = 8 * blocks[first : first + _BLOCKS, None] + inside
+        yield cells.reshape(-1, 3) * voxels.resolution_m
