@@ -1,20 +1,102 @@
-"""Saves the map of a flight beside its logs."""
+"""Reads and writes maps as files, the format by the suffix; saves the map of a flight beside its logs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+import companion
+from companion.core.errors import InputError
 from companion.core.node import Node
+from companion.mapping.formats.octomap import read_octomap, write_bt, write_ot
+from companion.mapping.formats.points import write_pcd, write_ply
+from companion.mapping.formats.stored_map import StoredMap, stored
+from companion.mapping.formats.umap import Progress, pack, unpack
 from companion.mapping.node import MappingNode
+from companion.mapping.sensor_model import SensorModel
+
+MAP_FILE = "map.umap"  # in the folder of a flight
+READABLE = (".umap", ".bt", ".ot", ".npz")
+_WRITERS: dict[str, Callable[[StoredMap], bytes]] = {
+    ".bt": write_bt,
+    ".ot": write_ot,
+    ".ply": write_ply,
+    ".pcd": write_pcd,
+}
+WRITABLE = (".umap", *_WRITERS)
 
 
 def save_map(path: Path, nodes: Sequence[Node]) -> None:
-    """Write `path` (.npz; `VoxelMap.from_arrays` reads it) if the map is among the nodes."""
+    """Write `path` (.umap) if the map is among the nodes."""
     for node in nodes:
         if isinstance(node, MappingNode):
-            arrays: dict[str, Any] = {**node.voxels.to_arrays()}
-            np.savez_compressed(path, **arrays)
+            write_map(path, stored(node.voxels, created_by=f"understory {companion.__version__}"))
+
+
+def read_map(path: Path, *, sensor: SensorModel | None = None, on_progress: Progress | None = None) -> StoredMap:
+    """The map of a file, in canonical form; of a folder, that of the flight in it.
+
+    `.umap` says its sensor model itself; for `.bt` and `.ot` it is `sensor`, by default ours.
+    Raises InputError that names the file and says what is wrong.
+    """
+    path = path / MAP_FILE if path.is_dir() else path
+    suffix = _suffix(path, READABLE)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(error.strerror or "cannot be read", file=str(path), valid="a map file") from error
+    if suffix == ".umap":
+        return unpack(data, file=str(path), on_progress=on_progress)
+    if suffix == ".npz":
+        return _read_npz(path)
+    return read_octomap(data, file=str(path), sensor=sensor)
+
+
+def write_map(path: Path, stored_map: StoredMap, *, on_progress: Progress | None = None) -> int:
+    """Write the map; returns the bytes. Raises InputError for a suffix or a place that cannot be."""
+    suffix = _suffix(path, WRITABLE)
+    if suffix == ".umap":
+        return write_file(path, pack(stored_map, on_progress=on_progress))
+    return write_file(path, _WRITERS[suffix](stored_map))
+
+
+def write_file(path: Path, data: bytes) -> int:
+    """Write the whole file or none of it; returns the bytes."""
+    part = path.with_name(f"{path.name}.part")
+    try:
+        part.write_bytes(data)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise InputError(error.strerror or "cannot be written", file=str(path), valid="a place to write to") from error
+    return len(data)
+
+
+def _suffix(path: Path, valid: Sequence[str]) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in valid:
+        raise InputError(f"no map by its name: {suffix or 'no suffix'}", file=str(path), valid=", ".join(valid))
+    return suffix
+
+
+def _read_npz(path: Path) -> StoredMap:
+    """`map.npz` of flights before `.umap`."""
+    try:
+        with np.load(path) as arrays:
+            hit, miss, lowest, highest = (float(v) for v in arrays["sensor_model"])
+            return StoredMap(
+                resolution_m=float(arrays["resolution_m"]),
+                sensor=SensorModel(hit=hit, miss=miss, lowest=lowest, highest=highest),
+                block_xyz=arrays["block_xyz"],
+                log_odds=arrays["log_odds"],
+                created_by="understory 0.1.0",
+            ).canonical()
+    except InputError as error:
+        raise InputError(error.problem, file=str(path), field=error.field, valid=error.valid) from error
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError("no map of an old flight", file=str(path), valid="map.npz of a flight") from error
