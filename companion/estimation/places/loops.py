@@ -1,0 +1,233 @@
+"""Finds places that were seen before, and what that says about the poses in between.
+
+Keyframes hang on a chain of odometry. Each few metres the newest submap is compared with the
+earlier ones by its trunks, then by registration; what holds becomes a closure of the pose graph,
+which doubts closures (DCS) but not the chain. The corrected poses are given so that the newest
+keyframe stays where odometry has it: what flies on odometry must not feel a loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
+from companion.core.messages import Array, Array32
+from companion.estimation.downsample import Thinner
+from companion.estimation.places.constellation import (
+    Constellation,
+    ConstellationConfig,
+    Place,
+    accepted,
+    constellation,
+    match,
+)
+from companion.estimation.places.trunks import TrunkConfig, detect_trunks
+from companion.estimation.places.verify import VerifyConfig, align
+from companion.estimation.pose_graph.graph import PoseGraph
+from companion.estimation.pose_graph.optimise import OptimiseConfig, optimise
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class LoopConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keyframes, submaps, and which pairs are compared."""
+
+    trunks: TrunkConfig = TrunkConfig()
+    constellation: ConstellationConfig = ConstellationConfig()
+    verify: VerifyConfig = VerifyConfig()
+    optimise: OptimiseConfig = OptimiseConfig(kernel="dcs")
+    keyframe_m: Positive = 2.0  # way between keyframes
+    submap_m: Positive = 6.0  # way between submaps
+    window_m: Positive = 16.0  # way whose scans make a submap
+    radius_m: Positive = 18.0  # of a submap
+    scan_every: Count = 3
+    thin_m: Positive = 0.08  # of scans and submaps
+    least_way_m: Positive = 30.0  # flown between two submaps that may close a loop
+    gate_m: Positive = 6.0  # distance by odometry of two submaps that are compared at most ...
+    gate_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03  # ... plus this share of the way between
+    most_closures: Count = 2  # per submap, nearest first
+    odometry_sigma_m: Positive = 0.01  # per keyframe ...
+    odometry_share: Positive = 0.01  # ... plus this share of the step
+    odometry_sigma_rad: Positive = 2e-3
+    closure_sigma_m: Positive = 0.03
+    closure_sigma_rad: Positive = 4e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closure:
+    """Keyframe `later` as seen from keyframe `earlier`; both are numbers of keyframes."""
+
+    earlier: int
+    later: int
+    R: Array  # (3, 3), of body axes
+    p: Array  # (3,), m, in the earlier body
+    trunks: int  # that agreed
+    near: float  # share of points that fit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Submap:
+    keyframe: int
+    sky: Constellation  # about the keyframe, in axes of odom
+    cloud: Array32  # likewise
+
+
+class LoopFinder:
+    """Feed it scans in order; `closures` grows when a place is recognised.
+
+    >>> finder = LoopFinder(LoopConfig())
+    >>> if finder.add(stamp_ns, points_body, R_odom_body, p_odom):
+    ...     corrected = finder.corrected()
+    """
+
+    def __init__(self, config: LoopConfig) -> None:
+        self.config = config
+        self.stamps_ns: list[int] = []
+        self.closures: list[Closure] = []
+        self._R: list[Array] = []  # of keyframes, as odometry had them
+        self._p: list[Array] = []
+        self._poses: list[Array] = []  # (7,) as corrected last, continued by odometry
+        self._way: list[float] = []
+        self._submaps: list[_Submap] = []
+        self._recent: deque[tuple[float, Array32]] = deque()  # (way, points in odom)
+        self._last: Array | None = None
+        self._flown_m = 0.0
+        self._scans = 0
+        self._thinner = Thinner()
+
+    def add(self, stamp_ns: int, points_body: Array32, R_odom_body: Array, p_odom: Array) -> int:
+        """Take in one scan (N, 3); returns the number of new closures."""
+        config = self.config
+        if self._last is not None:
+            self._flown_m += float(np.linalg.norm(p_odom - self._last))
+        self._last = p_odom
+        if self._scans % config.scan_every == 0:
+            self._remember(points_body, R_odom_body, p_odom)
+        self._scans += 1
+        if self._way and self._flown_m - self._way[-1] < config.keyframe_m:
+            return 0
+        self._keyframe(stamp_ns, R_odom_body, p_odom)
+        since = self._flown_m - (self._way[self._submaps[-1].keyframe] if self._submaps else 0.0)
+        return self._close() if since >= config.submap_m else 0
+
+    def corrected(self) -> Array:
+        """The most likely poses (K, 7) of the keyframes, x y z qw qx qy qz in odom, under which the newest stays."""
+        done = optimise(self._graph(), self.config.optimise).graph.poses
+        R_new, p_new = rotation_from_quaternion(done[-1, 3:]), done[-1, :3]
+        turn = self._R[-1] @ R_new.T
+        rotations = [turn @ rotation_from_quaternion(q) for q in done[:, 3:]]
+        places = (done[:, :3] - p_new) @ turn.T + self._p[-1]
+        poses = np.array([_pose(R, p) for R, p in zip(rotations, places, strict=True)])
+        self._poses = list(poses)
+        return poses
+
+    def _remember(self, points_body: Array32, R: Array, p: Array) -> None:
+        near = points_body[np.sum(points_body * points_body, axis=1) < self.config.radius_m**2]
+        points = self._thinner.firsts(np.ascontiguousarray(near), self.config.thin_m)
+        self._recent.append((self._flown_m, (points @ R.T + p).astype(np.float32)))
+        while self._flown_m - self._recent[0][0] > self.config.window_m:
+            self._recent.popleft()
+
+    def _keyframe(self, stamp_ns: int, R: Array, p: Array) -> None:
+        if self._poses:
+            last = self._poses[-1]
+            turn = rotation_from_quaternion(last[3:]) @ self._R[-1].T
+            pose = _pose(turn @ R, last[:3] + turn @ (p - self._p[-1]))
+        else:
+            pose = _pose(R, p)
+        self._poses.append(pose)
+        self._R.append(R.copy())
+        self._p.append(p.copy())
+        self._way.append(self._flown_m)
+        self.stamps_ns.append(stamp_ns)
+
+    def _close(self) -> int:
+        """Make a submap of what was seen last and look for it among the earlier ones."""
+        new = self._submap()
+        found = 0
+        for old in self._candidates(new):
+            closure = self._compare(old, new)
+            if closure is not None:
+                self.closures.append(closure)
+                found += 1
+            if found == self.config.most_closures:
+                break
+        self._submaps.append(new)
+        return found
+
+    def _submap(self) -> _Submap:
+        config, number = self.config, len(self._p) - 1
+        about = np.concatenate([points for _, points in self._recent]) - self._p[-1].astype(np.float32)
+        about = about[np.sum(about * about, axis=1) < config.radius_m**2]
+        cloud = self._thinner.firsts(np.ascontiguousarray(about), config.thin_m)
+        sky = constellation(detect_trunks(cloud.astype(np.float64), config.trunks).centers, config.constellation)
+        return _Submap(number, sky, cloud)
+
+    def _candidates(self, new: _Submap) -> list[_Submap]:
+        """Earlier submaps that odometry allows to be the same place, nearest first."""
+        here, way = self._poses[new.keyframe][:3], self._way[new.keyframe]
+        near: list[tuple[float, _Submap]] = []
+        for old in self._submaps:
+            between = way - self._way[old.keyframe]
+            distance = float(np.linalg.norm(self._poses[old.keyframe][:3] - here))
+            if between >= self.config.least_way_m and distance <= self._gate_m(between):
+                near.append((distance, old))
+        return [old for _, old in sorted(near, key=lambda pair: pair[0])]
+
+    def _gate_m(self, between_m: float) -> float:
+        return self.config.gate_m + self.config.gate_share * between_m
+
+    def _compare(self, old: _Submap, new: _Submap) -> Closure | None:
+        place = accepted(match(old.sky, new.sky, self.config.constellation), self.config.constellation)
+        if place is None:
+            return None
+        a, b = self._poses[old.keyframe], self._poses[new.keyframe]
+        between = self._way[new.keyframe] - self._way[old.keyframe]
+        if np.linalg.norm(place.p_map - (b[:2] - a[:2])) > self._gate_m(between):
+            return None
+        aligned = align(old.cloud, new.cloud, (_about_z(place.yaw), _above(place, b[2] - a[2])), self.config.verify)
+        if aligned is None:
+            return None
+        R_old, R_new = self._R[old.keyframe], self._R[new.keyframe]
+        R, p = R_old.T @ aligned.R @ R_new, R_old.T @ aligned.p
+        return Closure(old.keyframe, new.keyframe, R, p, place.inliers, aligned.near)
+
+    def _graph(self) -> PoseGraph:
+        """The chain of odometry, and the closures."""
+        config, count = self.config, len(self._p)
+        steps = [_relative(self._R[k], self._p[k], self._R[k + 1], self._p[k + 1]) for k in range(count - 1)]
+        ends = [(k, k + 1) for k in range(count - 1)] + [(c.earlier, c.later) for c in self.closures]
+        measured = np.array(steps + [_pose(c.R, c.p) for c in self.closures])
+        sigma_m = np.full(len(ends), config.closure_sigma_m)
+        sigma_m[: count - 1] = config.odometry_sigma_m + config.odometry_share * np.linalg.norm(
+            measured[: count - 1, :3], axis=1
+        )
+        sigma_rad = np.full(len(ends), config.closure_sigma_rad)
+        sigma_rad[: count - 1] = config.odometry_sigma_rad
+        weight = np.repeat(np.stack([sigma_m, sigma_rad], axis=1) ** -2.0, 3, axis=1)
+        information = weight[:, :, None] * np.eye(6)
+        return PoseGraph(np.arange(count), np.array(self._poses), np.array(ends), measured, information)
+
+
+def _pose(R: Array, p: Array) -> Array:
+    return np.concatenate([p, quaternion_from_rotation(R)])
+
+
+def _relative(R_a: Array, p_a: Array, R_b: Array, p_b: Array) -> Array:
+    return _pose(R_a.T @ R_b, R_a.T @ (p_b - p_a))
+
+
+def _about_z(yaw: float) -> Array:
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _above(place: Place, height_m: float) -> Array:
+    return np.array([place.p_map[0], place.p_map[1], height_m])
