@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from companion.core.errors import InputError
 from companion.core.messages import Array, Array32
 from companion.mapping.blocks import BlockStore
+from companion.mapping.cold_region import Blocks
+from companion.mapping.memory import Memory, MemoryConfig
 from companion.mapping.rays import BLOCK, CELLS, RayGrid
 from companion.mapping.sensor_model import UNKNOWN, SensorModel, quantise
 
@@ -31,6 +33,7 @@ class VoxelMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     max_range_m: _Metres = 30.0  # longer rays clear up to here and hit nothing
     miss_clear_range_m: _Metres = 15.0  # beams without return clear up to here; at most max_range_m
     sensor: SensorModel = SensorModel()
+    memory: MemoryConfig = MemoryConfig()
 
     def __post_init__(self) -> None:
         if self.miss_clear_range_m > self.max_range_m:
@@ -72,12 +75,15 @@ class VoxelMap:
         self.resolution_m = config.resolution_m
         self.steps = quantise(config.sensor)
         self.blocks = BlockStore()  # for the other files of this package
+        self.memory = Memory(
+            config.memory, self.blocks, resolution_m=config.resolution_m, lowest=self.steps.lowest
+        )  # far blocks, compressed: `blocks` holds the rest
         self._grid = RayGrid(config.resolution_m, config.max_range_m)
 
     @property
     def block_count(self) -> int:
         """Blocks of 8^3 voxels that hold a known voxel."""
-        return self.blocks.count
+        return self.blocks.count + self.memory.cold_blocks
 
     @property
     def version(self) -> int:
@@ -87,12 +93,13 @@ class VoxelMap:
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Positions (K, 3) of the blocks in which a voxel changed its class after `version`."""
         count = self.blocks.count
-        return self.blocks.xyz[:count][self.blocks.changed_at[:count] > version]
+        warm = self.blocks.xyz[:count][self.blocks.changed_at[:count] > version]
+        return np.concatenate([warm, self.memory.changed_since(version)])
 
     @property
     def memory_bytes(self) -> int:
         """Bytes of the map; the fixed scratch of insertion is not counted."""
-        return self.blocks.memory_bytes
+        return self.blocks.memory_bytes + self.memory.memory_bytes
 
     def insert(
         self,
@@ -122,6 +129,7 @@ class VoxelMap:
         misses = _rows(_NO_VECTORS if miss_dirs_body is None else miss_dirs_body)
         far_m, clear_m = self.config.max_range_m, self.config.miss_clear_range_m
         self._grid.place(origin)
+        self.memory.before_scan((self._grid.corner, self._grid.corner + self._grid.side))
         hit, steps = self._grid.cast(points, (R, p - origin, origin), (own_radius_m, far_m, False))
         missed, more = self._grid.cast(misses, (R, np.zeros(3), origin), (0.0, clear_m, True))
         self._grid.mark_free(free_odom)
@@ -141,24 +149,23 @@ class VoxelMap:
         return np.where(steps == UNKNOWN, UNKNOWN_CELL, known).astype(np.uint8)
 
     def occupied_centers(self) -> Array:
-        """Centres (K, 3) of all occupied voxels, m, in order of the map's growth."""
-        row, cell = np.nonzero(self.blocks.log_odds[: self.blocks.count] >= 0)
-        inside = np.stack([cell >> 6, (cell >> 3) & 7, cell & 7], axis=1)
-        return np.asarray((BLOCK * self.blocks.xyz[row] + inside + 0.5) * self.resolution_m)
+        """Centres (K, 3) of all occupied voxels, m, region by region."""
+        return np.concatenate([_NO_POINTS, *(self._occupied(part) for part in self.memory.parts())])
 
     def window(self, block_corner: NDArray[np.int64], states: NDArray[np.uint8]) -> None:
         """Fill `states` (8a, 8b, 8c) with 0 unknown, 1 free, 2 occupied from a block corner on."""
+        self.memory.bring_back((block_corner, block_corner + np.array(states.shape) // BLOCK))
         self.blocks.window(block_corner, states)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Copies of everything that makes the map, ready for `numpy.savez`."""
-        count = self.blocks.count
+        """Copies of everything that makes the map, ready for `numpy.savez`; the same map gives the same arrays."""
+        parts = [(part["xyz"], part["log_odds"]) for part in self.memory.parts()]
         model = self.config.sensor
         return {
             "resolution_m": np.array(self.resolution_m),
             "sensor_model": np.array([model.hit, model.miss, model.lowest, model.highest]),
-            "block_xyz": self.blocks.xyz[:count].copy(),
-            "log_odds": self.blocks.log_odds[:count].copy(),
+            "block_xyz": np.concatenate([np.empty((0, 3), np.int32), *(xyz for xyz, _ in parts)]),
+            "log_odds": np.concatenate([np.empty((0, CELLS), np.int8), *(values for _, values in parts)]),
         }
 
     @classmethod
@@ -180,7 +187,14 @@ class VoxelMap:
         points = np.asarray(points_odom, np.float64).reshape(-1, 3)
         good = np.all(np.abs(points) < 10 * _FARTHEST_M, axis=1)
         cells = np.floor(np.where(good[:, None], points, 0.0) / self.resolution_m).astype(np.int64)
-        return np.where(good, self.blocks.at(cells), np.int8(UNKNOWN))
+        found = self.blocks.at(cells)
+        self.memory.at(cells, found)
+        return np.where(good, found, np.int8(UNKNOWN))
+
+    def _occupied(self, part: Blocks) -> Array:
+        row, cell = np.nonzero(part["log_odds"] >= 0)
+        inside = np.stack([cell >> 6, (cell >> 3) & 7, cell & 7], axis=1)
+        return np.asarray((BLOCK * part["xyz"][row] + inside + 0.5) * self.resolution_m)
 
 
 def _rows(vectors: Array32) -> Array32:

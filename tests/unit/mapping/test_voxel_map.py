@@ -257,7 +257,7 @@ def test_a_growing_map_keeps_what_it_has():
     assert np.array_equal(voxels.query(probe), before, equal_nan=True)
     assert np.all(voxels.classify((places[:, None] + cloud).reshape(-1, 3)) == 2)
     assert len(np.unique(voxels.to_arrays()["block_xyz"], axis=0)) == voxels.block_count
-    assert 512 * voxels.block_count < voxels.memory_bytes < 700 * voxels.block_count + 4e6
+    assert voxels.memory_bytes < 700 * voxels.block_count + 4e6  # less by what is compressed
 
 
 def test_delta_names_the_blocks_that_changed():
