@@ -8,6 +8,7 @@ match spoils a landmark for good, a missed one costs nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -38,7 +39,7 @@ class AssociationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     """`gated`: optimal one-to-one assignment inside the gates; `nearest`: mutual nearest neighbours."""
     nearest_m: _Positive = 0.5  # `nearest` looks no farther
     chi2_gate: _Positive = 11.34  # squared Mahalanobis distance; 99 % of the true pairs, 3 degrees of freedom
-    hamming_gate: Annotated[int, msgspec.Meta(ge=0, le=256)] = 64  # differing bits of 256
+    hamming_gate: Annotated[int, msgspec.Meta(ge=0, le=256)] = 70  # differing bits of 256
     hamming_weight: Annotated[float, msgspec.Meta(ge=0.0)] = 0.2  # chi2 that a differing bit is worth
     ambiguity: Annotated[float, msgspec.Meta(ge=0.0)] = 2.0  # chi2 by which the best must win
 
@@ -137,12 +138,15 @@ def _within_reach(landmarks: NDArray[Any], seen: Observations, chi2_gate: float)
     """Pairs near enough for the gate, by spheres around the ellipsoids."""
     if len(seen) == 0 or len(landmarks) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
+    here, there = seen.position_odom, landmarks["position_odom"]
     widest = np.trace(landmarks["covariance"], axis1=1, axis2=2).max()
     reach = np.sqrt(chi2_gate * (np.trace(seen.covariance, axis1=1, axis2=2) + widest))
-    near = cKDTree(landmarks["position_odom"]).query_ball_point(seen.position_odom, reach, return_sorted=True)
+    low, high = here.min(axis=0) - reach.max(), here.max(axis=0) + reach.max()
+    local = np.flatnonzero(((there >= low) & (there <= high)).all(axis=1))
+    near = cKDTree(there[local]).query_ball_point(here, reach, return_sorted=True)
     counts = [len(rows) for rows in near]
-    rows = np.concatenate([np.asarray(rows, np.int64) for rows in near])
-    return np.repeat(np.arange(len(seen)), counts), rows
+    rows = np.fromiter(chain.from_iterable(near), np.int64, sum(counts))
+    return np.repeat(np.arange(len(seen)), counts), local[rows]
 
 
 def _assign(pairs: _Pairs, observations: int, landmarks: int, ambiguity: float) -> Rows:
@@ -153,7 +157,12 @@ def _assign(pairs: _Pairs, observations: int, landmarks: int, ambiguity: float) 
     size = observations + landmarks
     graph = coo_array((np.ones(len(pairs.cost)), (pairs.seen, observations + pairs.row)), shape=(size, size))
     cluster = connected_components(graph, directed=False)[1][pairs.seen]
-    order = np.argsort(cluster, kind="stable")
+    alone = np.bincount(cluster)[cluster] == 1  # nobody else wants either: most are
+    found[pairs.seen[alone]] = pairs.row[alone]
+    crowded = np.flatnonzero(~alone)
+    if len(crowded) == 0:
+        return found
+    order = crowded[np.argsort(cluster[crowded], kind="stable")]
     for part in np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1):
         seen, a = np.unique(pairs.seen[part], return_inverse=True)
         rows, b = np.unique(pairs.row[part], return_inverse=True)
@@ -177,8 +186,9 @@ def _best(cost: Array, rows: Rows, ambiguity: float) -> Rows:
     worse = swapped + swapped.T - mine[:, None] - mine
     worse[~(matched[:, None] | matched)] = np.inf
     np.fill_diagonal(worse, np.inf)
-    free = np.setdiff1d(np.arange(len(rows)), column)
-    other = (cost[:, free] - mine[:, None]).min(axis=1, initial=np.inf)
+    free = np.ones(len(rows), np.bool_)
+    free[column[matched]] = False
+    other = (cost[:, : len(rows)][:, free] - mine[:, None]).min(axis=1, initial=np.inf)
     other[~matched] = np.inf  # no landmark was worth it
     unclear = np.minimum(worse.min(axis=1, initial=np.inf), other) < ambiguity
     padded = np.concatenate([rows, np.full(len(cost), NEW)])

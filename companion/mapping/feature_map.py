@@ -2,8 +2,8 @@
 
 Each landmark is a small Kalman filter of a thing that does not move (the textbook's feature map:
 S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics", 2005, ch. 10). Correlations between
-landmarks are left out, so errors that all observations of one flight share do not average out:
-whoever observes puts them into the covariance.
+landmarks and between observations are left out: an error that all observations of a landmark
+share (a map's cells, a drift) does not average out, which `independence` accounts for.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ class FeatureMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     association: AssociationConfig = AssociationConfig()
     capacity: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 20_000  # landmarks; the least proven go first
+    independence: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
+    """Share of a later observation's information that is new; 1: errors of observations are independent."""
     proven: _Count = 2  # observations from which on a landmark is kept for good
     forget_after_s: Annotated[float, msgspec.Meta(gt=0.0)] = 30.0  # without another look, unless proven
 
@@ -64,16 +66,18 @@ class FeatureMap:
     def update(self, seen: Observations, rows: Rows, stamp_ns: int) -> None:
         """Fuse each observation whose row is >= 0 into that landmark; the others are passed over.
 
-        Information form: P'^-1 = P^-1 + R^-1, x' = P' (P^-1 x + R^-1 z), which any number of
-        times is least squares over all of them. The newest descriptor stays, since light and
-        view change; radii are averaged. Raises InputError if a row is named twice or not there.
+        Information form: P'^-1 = P^-1 + a R^-1, x' = P' (P^-1 x + a R^-1 z) with a = `independence`;
+        for a = 1 that is, any number of times, least squares over all of them. The newest descriptor
+        stays, since light and view change; radii are averaged. Raises InputError if a row is
+        named twice or not there.
         """
         which = np.flatnonzero(rows >= 0)
         at = rows[which]
         if len(rows) != len(seen) or len(np.unique(at)) != len(at) or np.any(at >= len(self)):
             raise InputError("one row per observation, none twice", field="rows", valid=f"below {len(self)}")
         known = self.landmarks[at]
-        before, gained = _inverse(known["covariance"]), _inverse(seen.covariance[which])
+        before = _inverse(known["covariance"])
+        gained = self.config.independence * _inverse(seen.covariance[which])
         covariance = _inverse(before + gained)
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         weighted = _times(before, known["position_odom"]) + _times(gained, seen.position_odom[which])
