@@ -29,7 +29,7 @@ class ColdRegion:
     """Blocks of one region, in order of their places."""
 
     count: int
-    newest_change: int  # largest `changed_at` inside
+    changes: tuple[int, int]  # smallest and largest `changed_at` inside
     held: bool  # a block of a loaded map is inside
     places: bytes  # a bit for each of the PLACES
     log_odds: bytes
@@ -51,7 +51,7 @@ def pack(blocks: Mapping[str, NDArray[Any]]) -> ColdRegion:
     planes = [array.view(np.uint8).reshape(len(array), -1).T.tobytes() for array in rest.values()]
     return ColdRegion(
         count=len(blocks["xyz"]),
-        newest_change=int(blocks["changed_at"].max()),
+        changes=(int(blocks["changed_at"].min()), int(blocks["changed_at"].max())),
         held=bool(blocks["held"].any()),
         places=np.packbits(there).tobytes(),
         log_odds=_deflate(blocks["log_odds"].tobytes()),
@@ -62,10 +62,21 @@ def pack(blocks: Mapping[str, NDArray[Any]]) -> ColdRegion:
 
 def unpack(region: ColdRegion, key: int) -> Blocks:
     """The blocks that `pack` was given; `key` is the region's."""
-    xyz = _corner(key) + _PLACE_XYZ[np.unpackbits(np.frombuffer(region.places, np.uint8)) != 0]
     log_odds = np.frombuffer(zlib.decompress(region.log_odds, -zlib.MAX_WBITS), np.int8)
-    blocks = {"xyz": xyz.astype(np.int32), "log_odds": log_odds.reshape(-1, CELLS)}
+    blocks: Blocks = {"xyz": xyz_of(region, key), "log_odds": log_odds.reshape(-1, CELLS)}
+    return blocks | unpack_rest(region)
+
+
+def xyz_of(region: ColdRegion, key: int) -> NDArray[np.int32]:
+    """Positions (N, 3) of its blocks."""
+    xyz = _corner(key) + _PLACE_XYZ[np.unpackbits(np.frombuffer(region.places, np.uint8)) != 0]
+    return np.asarray(xyz, np.int32)
+
+
+def unpack_rest(region: ColdRegion) -> Blocks:
+    """All arrays but those of positions and log-odds."""
     data, first = np.frombuffer(zlib.decompress(region.rest, -zlib.MAX_WBITS), np.uint8), 0
+    blocks: Blocks = {}
     for name, kind in region.layout:
         size = np.dtype(kind).itemsize
         planes = data[first : first + size * region.count].reshape(size, region.count)
@@ -91,6 +102,12 @@ def positions_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Positions (N, 3) of the regions of `keys` (N,)."""
     positions: NDArray[np.int64] = np.stack([keys >> 42, keys >> 21 & _AXIS, keys & _AXIS], axis=-1) - _HALF_RANGE
     return positions
+
+
+def in_region_order(block_xyz: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The positions (N, 3) sorted by region and place, as `Memory.parts` has them."""
+    ordered: NDArray[np.int32] = block_xyz[np.lexsort((places_of(block_xyz), keys_of(regions_of(block_xyz))))]
+    return ordered
 
 
 def places_of(block_xyz: NDArray[Any]) -> NDArray[np.int64]:

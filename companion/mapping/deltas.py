@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from companion.core.errors import InputError
 from companion.core.messages import MapDelta
+from companion.mapping.cold_region import in_region_order
 from companion.mapping.rays import CELLS
 from companion.mapping.voxel_map import VoxelMap
 
@@ -30,8 +31,8 @@ def records_of(voxels: VoxelMap, block_xyz: NDArray[np.int32]) -> Records:
     records = np.zeros(len(block_xyz), RECORD)
     records["xyz"] = block_xyz
     halves = records.view(np.uint16).reshape(len(records), RECORD.itemsize // 2)
-    rows = voxels.blocks.rows_of(block_xyz.astype(np.int64))
-    _pack(voxels.blocks.log_odds.view(np.uint64), rows, halves[:, RECORD["xyz"].itemsize // 2 :])
+    log_odds = voxels.memory.log_odds_of(block_xyz.astype(np.int64))
+    _pack(log_odds.view(np.uint64), halves[:, RECORD["xyz"].itemsize // 2 :])
     return records
 
 
@@ -83,7 +84,7 @@ class FullWalk:
     def __init__(self, voxels: VoxelMap, *, map_ns: int) -> None:
         self._map_ns = map_ns
         self._begun = voxels.version
-        self._left = in_order(voxels.changed_since(-1))
+        self._left = in_region_order(voxels.changed_since(-1))  # so that each cold region is unpacked once or twice
         self._stream = zlib.compressobj(_FASTEST)
         self._parts: list[bytes] = []
         self._count = 0
@@ -134,13 +135,11 @@ def unpack(delta: MapDelta) -> Records:
 
 
 @njit(cache=True, nogil=True)
-def _pack(log_odds, rows, halves):  # type: ignore[no-untyped-def]
-    """Eight cells of a word become 16 bits of the block's record; row -1: left as it is."""
+def _pack(log_odds, halves):  # type: ignore[no-untyped-def]
+    """Eight cells of a word become 16 bits of the block's record."""
     each, low = u64(0x0101010101010101), u64(0x7F7F7F7F7F7F7F7F)
-    for n in range(rows.size):
-        if rows[n] < 0:
-            continue
-        words = log_odds[rows[n]]
+    for n in range(log_odds.shape[0]):
+        words = log_odds[n]
         for w in range(words.size):
             x = words[w]
             negative = (x >> u64(7)) & each

@@ -32,6 +32,8 @@ from companion.mapping.cold_region import (
     region_key,
     regions_of,
     unpack,
+    unpack_rest,
+    xyz_of,
 )
 from companion.mapping.rays import BLOCK, CELLS
 from companion.mapping.sensor_model import UNKNOWN
@@ -64,6 +66,7 @@ class Memory:
         self._keep = int(min(np.ceil(config.keep_m / (BLOCK * resolution_m)), 1 << 20))  # blocks
         self._cold: dict[int, ColdRegion] = {}
         self._cold_bytes = 0
+        self._newest = -1  # no cold block changed after this version
         self._asked: Box = (np.zeros(3, np.int64), np.zeros(3, np.int64))
         self._start: NDArray[np.int64] | None = None  # region of the first scan
         self._scarce = False
@@ -123,9 +126,11 @@ class Memory:
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Positions (K, 3) of cold blocks in which a voxel changed its class after `version`."""
         parts = [np.empty((0, 3), np.int32)]
-        for key in sorted(k for k, region in self._cold.items() if region.newest_change > version):
-            blocks = unpack(self._cold[key], key)
-            parts.append(blocks["xyz"][blocks["changed_at"] > version])
+        some = [k for k, region in self._cold.items() if region.changes[1] > version] if self._newest > version else []
+        for key in sorted(some):
+            region, xyz = self._cold[key], xyz_of(self._cold[key], key)
+            all_of_it = region.changes[0] > version
+            parts.append(xyz if all_of_it else xyz[unpack_rest(region)["changed_at"] > version])
         return np.concatenate(parts)
 
     def parts(self) -> Iterator[Blocks]:
@@ -185,6 +190,7 @@ class Memory:
 
     def _keep_cold(self, key: int, region: ColdRegion) -> None:
         self._cold[key] = region
+        self._newest = max(self._newest, region.changes[1])
         self.cold_blocks += region.count
         self._cold_bytes += region.memory_bytes + _TABLE_BYTES
 

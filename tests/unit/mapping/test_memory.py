@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from companion.mapping.cold_region import (
     all_blocks,
+    in_region_order,
     keys_of,
     pack,
     places_of,
@@ -17,6 +18,8 @@ from companion.mapping.cold_region import (
     regions_of,
     unpack,
 )
+from companion.mapping.deltas import FullWalk, states_of
+from companion.mapping.deltas import unpack as records_from
 from companion.mapping.memory import MemoryConfig
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 
@@ -86,7 +89,7 @@ def test_a_packed_region_comes_back_as_it_was(seed, count, corner):
     for name, array in blocks.items():
         assert again[name].dtype == array.dtype
         assert np.array_equal(again[name], array), name
-    assert (region.count, region.newest_change) == (count, blocks["changed_at"].max())
+    assert (region.count, region.changes) == (count, (blocks["changed_at"].min(), blocks["changed_at"].max()))
     assert region.held == bool(blocks["held"].any())
 
 
@@ -121,9 +124,8 @@ def test_over_random_walks_the_map_is_the_one_without_eviction(walk, seed, few, 
     assert plain.version == lean.version
     assert plain.block_count == lean.block_count
     assert np.array_equal(plain.query(probe), lean.query(probe), equal_nan=True)
-    version = plain.version // 2
-    changed = [np.sort(keys_of(voxels.changed_since(version).astype(np.int64))) for voxels in (plain, lean)]
-    assert np.array_equal(*changed)
+    for version in (-1, 0, plain.version // 2, plain.version - 1, plain.version):
+        assert np.array_equal(*[in_region_order(voxels.changed_since(version)) for voxels in (plain, lean)])
     assert np.array_equal(plain.occupied_centers(), lean.occupied_centers())
 
 
@@ -202,6 +204,21 @@ def test_blocks_are_read_wherever_they_lie():
     assert np.array_equal(plain.memory.log_odds_of(asked), lean.memory.log_odds_of(asked))
     assert np.all(lean.memory.log_odds_of(nowhere) == -128)
     assert lean.memory.cold_regions == cold  # reading moves nothing
+
+
+def test_a_whole_walk_for_late_joiners_tells_of_cold_blocks():
+    plain, lean = there_and_back(NEVER), there_and_back(EAGER)
+    for voxels in (plain, lean):
+        walk, full = FullWalk(voxels, map_ns=0), None
+        while full is None:
+            full = walk.advance(voxels, blocks=250, stamp_ns=5)
+        records = records_from(full)
+        xyz = whole(plain)["xyz"]
+        assert np.array_equal(in_region_order(records["xyz"]), xyz)
+        order = np.lexsort(xyz.T[::-1])
+        wanted = whole(plain)["log_odds"][order]
+        states = states_of(records[np.lexsort(records["xyz"].T[::-1])])
+        assert np.array_equal(states, np.where(wanted == -128, 0, np.where(wanted < 0, 1, 2)))
 
 
 def test_blocks_of_a_loaded_map_stay_so_when_they_were_away():
