@@ -10,6 +10,7 @@ from collections.abc import Callable
 import msgspec
 
 from companion.core.errors import InputError
+from companion.planning.lattice.planner import AStar, Dijkstra, LatticeConfig, ThetaStar
 from companion.planning.planner import Planner
 from companion.planning.rrt_star import RRTStar, RRTStarConfig
 
@@ -18,10 +19,14 @@ class PlannerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Settings of every planner, also of those that do not fly."""
 
     rrt_star: RRTStarConfig = RRTStarConfig()
+    lattice: LatticeConfig = LatticeConfig()
 
 
 PLANNERS: dict[str, Callable[[PlannerSettings], Planner]] = {
     "rrt_star": lambda settings: RRTStar(settings.rrt_star),
+    "dijkstra": lambda settings: Dijkstra(settings.lattice),
+    "astar": lambda settings: AStar(settings.lattice),
+    "theta_star": lambda settings: ThetaStar(settings.lattice),
 }
 
 

@@ -1,0 +1,1 @@
+"""Graph search on grids of cells: Dijkstra, A*, Theta*. Lengths are in cells."""

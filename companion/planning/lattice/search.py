@@ -1,0 +1,132 @@
+"""A* (Hart, Nilsson and Raphael 1968) on a padded grid; without a heuristic it is Dijkstra's algorithm.
+
+Nodes are flat indices of the padded grid, whose rim is blocked. label: 0 unseen; 1 + move that led here, with CLOSED
+once expanded. A node that gets a cheaper way is opened again, so the order within a bucket of the open list does not
+matter: with an admissible bound the cost is the least. A weighted search opens none again (Likhachev, Gordon and Thrun
+2003): its cost is at most the weight times the least, and a bucket.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from companion.planning.lattice.heuristics import estimate
+from companion.planning.lattice.open_list import BUCKET, PER_CELL, empty_list, pop, push, with_room
+
+CLOSED = 64
+NEVER = 1e30
+SAME = 1e-9  # cells; less is rounding
+
+
+@njit(cache=True, nogil=True)
+def search(blocked, shape, moves, ends, bound, label, cost):  # type: ignore[no-untyped-def]
+    """Cost of the way, number of expansions, and every node seen.
+
+    blocked (V,), shape (3,) of the padded grid; moves = (flat offsets (M,), offsets (M, 3), lengths (M,), needs (M,));
+    ends = start, goal; bound = heuristic's number, weight, whether to open closed nodes again. `label` (V,) all 0,
+    `cost` (V,): scratch, holds the answer.
+    """
+    start, goal = ends
+    open_list, to = empty_list(), unflat(goal, shape)
+    heads, pool, state = open_list
+    seen, count, expanded, best = np.empty(4096, np.int32), 1, 0, NEVER
+    seen[0], cost[start], label[start] = start, 0.0, 1
+    f = bound[1] * _bound_at(bound[0], unflat(start, shape), to)
+    state[BUCKET] = int(f * PER_CELL)
+    push(heads, pool, state, start, f)
+    while True:
+        v = pop(heads, pool, state, best)
+        if v < 0:
+            return best, expanded, seen[:count]
+        if label[v] & CLOSED:
+            continue
+        label[v] |= CLOSED
+        if v == goal:
+            best = cost[v]
+            continue
+        at = unflat(v, shape)
+        if cost[v] + bound[1] * _bound_at(bound[0], at, to) >= best - SAME:
+            continue
+        expanded += 1
+        pool = with_room(pool, state)
+        seen = with_space(seen, count)
+        walls = surroundings(blocked, v, shape)
+        left = (at[0] - to[0], at[1] - to[1], at[2] - to[2])
+        count = _relax(v, walls, left, moves, bound, best, label, cost, (heads, pool, state), seen, count)
+
+
+@njit(cache=True, nogil=True)
+def _relax(v, walls, left, moves, bound, best, label, cost, open_list, seen, count):  # type: ignore[no-untyped-def]
+    """Offer every neighbour of `v` the way through it; returns how many nodes were seen so far."""
+    flat, offsets, lengths, needs = moves
+    heads, pool, state = open_list
+    for m in range(len(flat)):
+        if walls & needs[m]:
+            continue
+        u, way = v + flat[m], cost[v] + lengths[m]
+        if label[u] and (way >= cost[u] - SAME or (label[u] & CLOSED and not bound[2])):
+            continue
+        dx, dy, dz = left[0] + offsets[m, 0], left[1] + offsets[m, 1], left[2] + offsets[m, 2]
+        f = way + bound[1] * estimate(bound[0], abs(dx), abs(dy), abs(dz))
+        if f >= best - SAME:
+            continue
+        if label[u] == 0:
+            seen[count] = u
+            count += 1
+        label[u], cost[u] = 1 + m, way
+        push(heads, pool, state, u, f)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def walk_back(flat, ends, label):  # type: ignore[no-untyped-def]
+    """The nodes (N,) from start to goal, along the moves that led there."""
+    start, goal = ends
+    count, v = 1, goal
+    while v != start:
+        v -= flat[(label[v] & (CLOSED - 1)) - 1]
+        count += 1
+    nodes, v = np.empty(count, np.int64), goal
+    for n in range(count - 1, -1, -1):
+        nodes[n] = v
+        if n > 0:
+            v -= flat[(label[v] & (CLOSED - 1)) - 1]
+    return nodes
+
+
+@njit(cache=True, nogil=True)
+def surroundings(blocked, v, shape):  # type: ignore[no-untyped-def]
+    """Bit set of the blocked cells among the 27 around a node."""
+    walls, bit = np.uint32(0), np.uint32(1)
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            low = v + (a * shape[1] + b) * shape[2] - 1
+            for c in range(3):
+                if blocked[low + c]:
+                    walls |= bit
+                bit <<= np.uint32(1)
+    return walls
+
+
+@njit(cache=True, nogil=True)
+def unflat(v, shape):  # type: ignore[no-untyped-def]
+    """Indices along the axes."""
+    row = v // shape[2]
+    return row // shape[1], row % shape[1], v % shape[2]
+
+
+@njit(cache=True, nogil=True)
+def _bound_at(kind, p, q):  # type: ignore[no-untyped-def]
+    return estimate(kind, abs(p[0] - q[0]), abs(p[1] - q[1]), abs(p[2] - q[2]))
+
+
+@njit(cache=True, nogil=True)
+def with_space(nodes, count):  # type: ignore[no-untyped-def]
+    """The list, or a longer copy, with space for all neighbours of a node."""
+    if count + 32 <= len(nodes):
+        return nodes
+    larger = np.empty(2 * len(nodes), nodes.dtype)
+    for n in range(len(nodes)):
+        larger[n] = nodes[n]
+    return larger
