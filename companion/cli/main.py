@@ -54,6 +54,10 @@ GROUPS = {  # group -> help, command -> module and function
     ),
     "mavlink": ("Look into MAVLink logs.", {"inspect": "mavlink:inspect"}),
     "graph": ("Optimise pose graphs.", {"optimise": "graph:optimise_file"}),
+    "map": (
+        "Look into maps, convert, slice and draw them.",
+        {"info": "map:info", "convert": "map:convert", "slice": "map:slice_", "view": "map:view"},
+    ),
     "bench": ("Measure this machine.", {"bus": "bench:bus", "mapping": "bench_mapping:mapping"}),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",

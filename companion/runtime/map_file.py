@@ -44,7 +44,7 @@ def read_map(path: Path, *, sensor: SensorModel | None = None, on_progress: Prog
     `.umap` says its sensor model itself; for `.bt` and `.ot` it is `sensor`, by default ours.
     Raises InputError that names the file and says what is wrong.
     """
-    path = path / MAP_FILE if path.is_dir() else path
+    path = map_path(path)
     suffix = _suffix(path, READABLE)
     try:
         data = path.read_bytes()
@@ -55,6 +55,19 @@ def read_map(path: Path, *, sensor: SensorModel | None = None, on_progress: Prog
     if suffix == ".npz":
         return _read_npz(path)
     return read_octomap(data, file=str(path), sensor=sensor)
+
+
+def map_path(path: Path) -> Path:
+    """The file itself, or the map in the folder of a flight."""
+    if not path.is_dir():
+        return path
+    old = path / "map.npz"
+    return old if old.exists() and not (path / MAP_FILE).exists() else path / MAP_FILE
+
+
+def check_writable(path: Path) -> None:
+    """Raises InputError if the suffix is none that can be written."""
+    _suffix(path, WRITABLE)
 
 
 def write_map(path: Path, stored_map: StoredMap, *, on_progress: Progress | None = None) -> int:

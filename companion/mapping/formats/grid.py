@@ -19,6 +19,7 @@ from companion.mapping.rays import BLOCK
 from companion.mapping.sensor_model import UNKNOWN
 
 MOST_CELLS = 400_000_000
+_FARTHEST_M = 1e7  # NaN and infinity are not within it
 GROUND_SLOPE, GROUND_STEP_M = 1.0, 0.4  # as in FieldConfig
 _CHUNK = 1 << 15  # blocks whose temporaries are in memory at once
 _EXACT = 1e-9  # cells: a border within it of a cell's face is that face
@@ -40,10 +41,11 @@ def occupancy_grid(
 
     Heights are z of the frame, or, with `ground_z` (X, Y) of `ground_height`, above the ground.
     A column is unknown where nothing in the band is known. `crop` drops rims that are unknown.
-    Takes a canonical map. Raises InputError for a band upside down or an area that is too large.
+    Takes a canonical map. Raises InputError for a band upside down or in which nothing is known, and
+    for an area that is too large.
     """
-    if not low_m <= high_m:
-        raise InputError(f"{low_m} to {high_m} m is upside down", field="band", valid="low <= high")
+    if not -_FARTHEST_M <= low_m <= high_m <= _FARTHEST_M:
+        raise InputError(f"{low_m:g} to {high_m:g} m is no band", field="band", valid="low <= high")
     cell_m = stored.resolution_m
     base = np.zeros((1, 1)) if ground_z is None else np.asarray(ground_z, np.float64) / cell_m
     low = np.floor(base + low_m / cell_m + _EXACT)
@@ -58,8 +60,10 @@ def occupancy_grid(
         inside = (z >= low[column][..., None]) & (z <= high[column][..., None])
         np.maximum.at(best, column, np.where(inside, cells, np.int8(UNKNOWN)).max(axis=3))
     plane = best.transpose(0, 2, 1, 3).reshape(size)
+    if not np.any(plane != UNKNOWN):
+        raise InputError(f"nothing is known at {low_m:g} to {high_m:g} m", field="band", valid=_heights(stored))
     first = np.zeros(2, np.int64)
-    if crop and np.any(plane != UNKNOWN):
+    if crop:
         spans = [np.flatnonzero(np.any(plane != UNKNOWN, axis=1 - axis)) for axis in (0, 1)]
         first = np.array([span[0] for span in spans])
         plane = plane[spans[0][0] : spans[0][-1] + 1, spans[1][0] : spans[1][-1] + 1]
@@ -103,6 +107,12 @@ def _footprint(stored: StoredMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]
         sides = " x ".join(f"{BLOCK * n:,}" for n in blocks)
         raise InputError(f"{sides} cells are too many", field="extent", valid=f"up to {MOST_CELLS:,}")
     return corner, blocks
+
+
+def _heights(stored: StoredMap) -> str:
+    edge_m = BLOCK * stored.resolution_m
+    z = stored.block_xyz[:, 2].astype(np.float64)
+    return f"heights of the map, within z of {z.min() * edge_m:g} to {(z.max() + 1) * edge_m:g} m"
 
 
 def _columns(
