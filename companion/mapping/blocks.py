@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,9 @@ from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid
 from companion.mapping.sensor_model import UNKNOWN, Steps
 
 u8, u64 = np.uint8, np.uint64
+Watch = Callable[[NDArray[np.int64], NDArray[np.int64], tuple[NDArray[np.uint64], NDArray[np.uint64]]], None]
+"""Sees a scan right before it changes the store: numbers (K,) of the scratch blocks it met, rows (K,)
+of the store, and the bits `free`, `hit` (N, 8) of all scratch blocks."""
 _GROWTH = 4096  # blocks: 2 MB at a time, so that growing never stalls a scan
 _PER_ROW = ("xyz", "log_odds", "changed_at", "seen_ns", "held", "_settled")
 
@@ -39,13 +42,20 @@ class BlockStore:
         self._rows = np.zeros(4 * _GROWTH, np.int32)
 
     @property
+    def table(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """The hash as kernels want it, (keys, rows): `slot_of` finds a block in it."""
+        return self._keys, self._rows
+
+    @property
     def memory_bytes(self) -> int:
         """Bytes held, spare capacity included."""
         arrays = [getattr(self, name) for name in _PER_ROW]
         return sum(int(a.nbytes) for a in (*arrays, self._keys, self._rows))
 
-    def fold(self, grid: RayGrid, steps: Steps, stamp_ns: int) -> tuple[int, NDArray[np.int32]]:
-        """Add one scan's bits to the log-odds, and clear the bits.
+    def fold(
+        self, grid: RayGrid, steps: Steps, stamp_ns: int, watch: Watch | None = None
+    ) -> tuple[int, NDArray[np.int32]]:
+        """Add one scan's bits to the log-odds, and clear the bits; `watch` sees them right before.
 
         Returns the number of blocks met and the positions (K, 3) of those in which a cell
         changed between unknown, free and occupied.
@@ -59,6 +69,8 @@ class BlockStore:
         amounts = np.array([steps.hit, steps.miss, steps.lowest, steps.highest], np.int16)
         changed = np.zeros(len(met), np.uint8)
         words = (grid.free.reshape(-1, WORDS), grid.hit.reshape(-1, WORDS))
+        if watch is not None:
+            watch(met, rows, words)
         fold_bits(met, rows, words, (self.log_odds, self._settled), amounts, changed)
         self.seen_ns[rows] = stamp_ns
         return len(met), self.xyz[self.mark_changed(rows[changed != 0])]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from companion.core.errors import InputError
 from companion.core.messages import Array, Array32
-from companion.mapping.blocks import BlockStore
+from companion.mapping.blocks import BlockStore, Watch
 from companion.mapping.cold_region import Blocks
 from companion.mapping.memory import Memory, MemoryConfig
 from companion.mapping.rays import BLOCK, CELLS, RayGrid
@@ -75,9 +76,7 @@ class VoxelMap:
         self.resolution_m = config.resolution_m
         self.steps = quantise(config.sensor)
         self.blocks = BlockStore()  # for the other files of this package
-        self.memory = Memory(
-            config.memory, self.blocks, resolution_m=config.resolution_m, lowest=self.steps.lowest
-        )  # far blocks, compressed: `blocks` holds the rest
+        self.memory = _memory(self)  # far blocks, compressed: `blocks` holds the rest
         self._grid = RayGrid(config.resolution_m, config.max_range_m)
 
     @property
@@ -112,6 +111,7 @@ class VoxelMap:
         free_odom: Array = _NO_POINTS,
         own_radius_m: float = 0.0,
         stamp_ns: int = 0,
+        watch: Watch | None = None,
     ) -> Delta:
         """Take in one scan.
 
@@ -121,6 +121,7 @@ class VoxelMap:
         `R_odom_body` (3, 3); `p_odom` (3,) is the body. The voxels of `free_odom` (K, 3), m,
         are free by other knowledge: one miss. Points nearer to the body's origin than
         `own_radius_m`, and what is not finite, is dropped. `stamp_ns` is when the scan was.
+        `watch` sees which blocks the scan meets before they change (`companion.mapping.submaps`).
         Raises InputError when the pose is not finite or farther than 100 km.
         """
         R, p, origin = (np.asarray(a, np.float64) for a in (R_odom_body, p_odom, origin_odom))
@@ -133,9 +134,20 @@ class VoxelMap:
         hit, steps = self._grid.cast(points, (R, p - origin, origin), (own_radius_m, far_m, False))
         missed, more = self._grid.cast(misses, (R, np.zeros(3), origin), (0.0, clear_m, True))
         self._grid.mark_free(free_odom)
-        met, changed = self.blocks.fold(self._grid, self.steps, stamp_ns)
+        met, changed = self.blocks.fold(self._grid, self.steps, stamp_ns, watch)
         dropped = len(points) + len(misses) - hit - missed
         return Delta(hit, missed, dropped, steps + more, met, changed)
+
+    def blank(self) -> VoxelMap:
+        """An empty map of the same kind, which shares the scratch of insertion."""
+        other = copy(self)
+        other.blocks = BlockStore()
+        other.memory = _memory(other)
+        return other
+
+    def replace(self, other: VoxelMap) -> None:
+        """Become what `other`, made by `blank`, is; that must not be used any more."""
+        self.blocks, self.memory = other.blocks, other.memory
 
     def query(self, points_odom: Array) -> Array32:
         """Log-odds (N,) of being occupied at points (N, 3), m; NaN: unknown."""
@@ -195,6 +207,12 @@ class VoxelMap:
         row, cell = np.nonzero(part["log_odds"] >= 0)
         inside = np.stack([cell >> 6, (cell >> 3) & 7, cell & 7], axis=1)
         return np.asarray((BLOCK * part["xyz"][row] + inside + 0.5) * self.resolution_m)
+
+
+def _memory(voxels: VoxelMap) -> Memory:
+    """What puts blocks of the map away."""
+    config = voxels.config
+    return Memory(config.memory, voxels.blocks, resolution_m=config.resolution_m, lowest=voxels.steps.lowest)
 
 
 def _rows(vectors: Array32) -> Array32:

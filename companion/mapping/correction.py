@@ -1,0 +1,226 @@
+"""The map follows when the pose graph corrects past poses (loop closure), beside insertion.
+
+A second map is built in bounded steps: the evidence of each stretch of the flight, moved to
+where the corrected poses put it, is added up. Meanwhile scans go on into the present map. In the
+last step the open stretch is added, too, and the second map takes the place of the first.
+The same idea with other means: V. Reijgwart et al., "Voxgraph", RA-L 2020 (submaps as signed
+distances, aligned by a pose graph).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from companion.mapping.cold_region import unpack
+from companion.mapping.evidence import Levels, added
+from companion.mapping.moved_blocks import MovedBlocks
+from companion.mapping.pose_track import PoseCorrector, PoseShift
+from companion.mapping.rays import CELLS
+from companion.mapping.sensor_model import UNKNOWN
+from companion.mapping.submaps import Submap, SubmapConfig, Submaps
+from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+
+_LEAP = 1 << 40  # versions: more than insertion makes while a correction runs
+_PART = 2048  # blocks at a time: 1 MB, which a cache holds
+_STAY = PoseShift(np.eye(3), np.zeros(3))
+
+
+class CorrectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When the map follows, and how much of the work each scan does."""
+
+    blocks_per_scan: Annotated[int, msgspec.Meta(ge=1)] = 8192  # of 8^3 voxels, moved and added up
+    least_shift: Annotated[float, msgspec.Meta(ge=0.0, le=10.0)] = 0.5  # voxels: what moves less stays
+
+
+@dataclass(frozen=True, slots=True)
+class Corrected:
+    """What a correction did."""
+
+    moved: int  # stretches that came to lie elsewhere
+    stayed: int
+    blocks: int  # of the map now
+    changed: int  # blocks in which a voxel changed its class
+
+
+class Correction:
+    """One correction of `voxels`; `advance` until it returns what was done.
+
+    >>> correction = Correction(config, voxels, submaps, PoseCorrector(submaps.track, stamps_ns, p, q))
+    >>> while (done := correction.advance()) is None:
+    ...     voxels.insert(...)  # insertion goes on
+    """
+
+    def __init__(self, config: CorrectionConfig, voxels: VoxelMap, submaps: Submaps, poses: PoseCorrector) -> None:
+        self.config = config
+        self._voxels, self._submaps, self._poses = voxels, submaps, poses
+        self._second = voxels.blank()
+        self._second.blocks.version = voxels.version + _LEAP  # whatever is in it counts as changed
+        self._loaded = self._next = self._moved = 0
+        self._now: MovedBlocks | None = None
+        self._first = 0  # block of `_now` that comes next
+        self._last_ns = 0
+
+    @property
+    def needed(self) -> bool:
+        """Whether anything at rest moves by more than `least_shift`."""
+        return any(self._shift(submap) is not _STAY for submap in self._submaps.closed)
+
+    def advance(self) -> Corrected | None:
+        """One bounded step; None: there is more to do."""
+        left = self.config.blocks_per_scan
+        self._keep_small()
+        while left > 0:
+            if self._now is not None:
+                left -= self._add(min(left, _PART))
+            elif self._loaded < len(self._submaps.loaded):
+                left -= self._take_loaded()
+            elif self._next < len(self._submaps.closed):
+                self._open(self._submaps.closed[self._next])
+                self._next += 1
+                return None  # that was work enough
+            else:
+                return self._finish() if self._submaps.settled else None
+        return None
+
+    def _shift(self, submap: Submap) -> PoseShift:
+        """How a stretch moves."""
+        shift = self._poses.shift_at(submap.anchor_ns)
+        _, p = self._submaps.track.at(submap.anchor_ns)
+        reach_m = 0.5 * self._voxels.config.max_range_m
+        least_m = self.config.least_shift * self._voxels.resolution_m
+        return shift if shift.size_m(p, reach_m) > least_m else _STAY
+
+    def _take_loaded(self) -> int:
+        """One region of a loaded map, which stays where it is."""
+        key, region = self._submaps.loaded[self._loaded]
+        self._second.blocks.put(unpack(region, key), self._voxels.steps.lowest)
+        self._loaded += 1
+        return region.count
+
+    def _open(self, submap: Submap, values: Levels | None = None) -> None:
+        """Move a stretch; its blocks are added by `_add`."""
+        shift = self._shift(submap)
+        evidence = submap.values(self._voxels.steps) if values is None else values
+        self._now, self._first, self._last_ns = (
+            MovedBlocks(submap.xyz, evidence, shift, self._voxels.resolution_m),
+            0,
+            submap.last_ns,
+        )
+        self._moved += shift is not _STAY
+        self._keep_small()
+
+    def _keep_small(self) -> None:
+        """Put away what of the second map is far from the stretch at hand, once the map takes half its budget."""
+        memory = self._second.memory
+        large = self._second.memory_bytes > 0.5e6 * memory.config.budget_mb
+        if self._now is not None and len(self._now.xyz) and (large or memory.cold_regions):
+            xyz = self._now.xyz.astype(np.int64)
+            memory.before_scan((xyz.min(axis=0), xyz.max(axis=0) + 1))
+
+    def _add(self, count: int) -> int:
+        """Add up to `count` blocks of the stretch at hand to the second map; returns how many."""
+        assert self._now is not None
+        first, last = self._first, min(self._first + count, len(self._now.xyz))
+        values, xyz = self._now.cells(first, last), self._now.xyz[first:last]
+        known = np.flatnonzero(_any_known(values))
+        values, xyz = values[known], xyz[known]
+        blocks, steps = self._second.blocks, self._voxels.steps
+        rows = blocks.rows_of(xyz.astype(np.int64))
+        levels = np.full(values.shape, UNKNOWN, np.int8)
+        old = np.flatnonzero(rows >= 0)
+        levels[old] = blocks.log_odds[rows[old]]
+        levels = added(levels, values, (steps.lowest, steps.highest))
+        new = np.flatnonzero(rows < 0)
+        blocks.write(rows[old], levels[old], steps.lowest)
+        rows[new] = np.arange(blocks.count, blocks.count + len(new))
+        blocks.add(xyz[new], levels[new], steps.lowest, held=False)
+        blocks.seen_ns[rows] = np.maximum(blocks.seen_ns[rows], self._last_ns)
+        self._first = last
+        if last == len(self._now.xyz):
+            self._now = None
+        return max(last - first, 1)
+
+    def _finish(self) -> Corrected:
+        """Add the open stretch, and put the second map in the place of the first."""
+        open_stretch = self._submaps.close()
+        if open_stretch is not None:
+            self._open(*open_stretch)
+            while self._now is not None:
+                self._add(_PART)
+        changed = self._tell_changes()
+        self._voxels.replace(self._second)
+        total = len(self._submaps.closed) + (open_stretch is not None)
+        return Corrected(self._moved, total - self._moved, self._voxels.block_count, changed)
+
+    def _tell_changes(self) -> int:
+        """Give each block of the second map the version of its last change; returns how many change now.
+
+        A block that has gone stays as an unknown one, so that `changed_since` can name it. What is
+        compressed counts as changed.
+        """
+        old, new = self._voxels.blocks, self._second.blocks
+        gone = self._gone()
+        new.add(gone, np.full((len(gone), CELLS), UNKNOWN, np.int8), self._voxels.steps.lowest, held=False)
+        new.mark_changed(np.empty(0, np.int64))
+        rows = old.rows_of(new.xyz[: new.count].astype(np.int64))
+        same = np.empty(new.count, np.bool_)
+        _same_classes(new.log_odds, rows, old.log_odds, same)
+        new.changed_at[: new.count] = np.where(same, old.changed_at[rows], new.version)
+        return int(self._second.block_count - np.count_nonzero(same))
+
+    def _gone(self) -> NDArray[np.int32]:
+        """Positions (N, 3) of the blocks that the second map does not have."""
+        xyz = self._voxels.blocks.xyz[: self._voxels.blocks.count]
+        if self._voxels.memory.cold_regions:
+            xyz = np.concatenate([xyz, self._voxels.memory.changed_since(-1)])
+        xyz = xyz[self._second.blocks.rows_of(xyz.astype(np.int64)) < 0]
+        if self._second.memory.cold_regions and len(xyz):
+            xyz = xyz[~_any_known(self._second.memory.log_odds_of(xyz.astype(np.int64)))]
+        return xyz
+
+
+def warm_correction(config: VoxelMapConfig) -> None:
+    """Compile all kernels of submaps and corrections, on a map of two voxels."""
+    voxels = VoxelMap(config)
+    submaps = Submaps(SubmapConfig(), voxels)
+    points = np.array([[1.0, 0.0, 0.0]], np.float32)
+    here, turned = np.array([0.1, 0.1, 0.1]), np.array([[1.0, 0.0, 0.0, 0.0], [0.8, 0.0, 0.0, 0.6]])
+    for stamp_ns in range(2):
+        voxels.insert(points, R_odom_body=np.eye(3), p_odom=here, origin_odom=here, watch=submaps.watch)
+        submaps.after_scan(stamp_ns, here, turned[0])
+        submaps.close()
+    submaps.after_scan(2, here, turned[0])
+    poses = PoseCorrector(submaps.track, np.arange(2), np.stack([here, here]), turned)
+    correction = Correction(CorrectionConfig(), voxels, submaps, poses)
+    while correction.advance() is None:
+        pass
+
+
+@njit(cache=True, nogil=True)
+def _any_known(values):  # type: ignore[no-untyped-def]
+    found = np.zeros(values.shape[0], np.bool_)
+    for n in range(values.shape[0]):
+        most = np.int8(UNKNOWN)
+        for c in range(CELLS):
+            most = max(most, values[n, c])
+        found[n] = most != np.int8(UNKNOWN)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _same_classes(new, rows, old, same):  # type: ignore[no-untyped-def]
+    """Whether each block has the classes of its row in `old`; a row of -1 has no block."""
+    unknown, zero = np.int8(UNKNOWN), np.int8(0)
+    for n in range(rows.size):
+        differ = np.int8(0 if rows[n] >= 0 else -1)
+        for c in range(CELLS if rows[n] >= 0 else 0):
+            a, b = new[n, c], old[rows[n], c]
+            differ = np.int8(differ | np.int8(a ^ b))  # its sign bit: occupied <-> free or unknown
+            differ = np.int8(differ | (unknown if (a == unknown) != (b == unknown) else zero))
+        same[n] = differ >= zero

@@ -1,0 +1,161 @@
+"""What one stretch of the flight adds to the map, cell by cell, and its form at rest: 2 bits per cell.
+
+The map's log-odds before and after, with the cells that rays crossed and hit in between, tell
+what the stretch saw. Added up again over all stretches, with the map's clamps, they give the map.
+Where a clamp hides how much was seen, the evidence is what leads to the clamp from any belief
+that the map can have held there.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from companion.mapping.rays import CELLS, WORDS
+from companion.mapping.sensor_model import UNKNOWN, Steps
+
+i16, i64, u8, u64 = np.int16, np.int64, np.uint8, np.uint64
+_PACKED = CELLS // 4  # bytes of a block's codes
+_WEAK, _STRONG, _LISTED = 1, 2, 3  # codes; 0: not seen
+Levels = NDArray[np.int8]
+
+
+def evidence(
+    before: Levels, after: Levels, bits: tuple[NDArray[np.uint64], NDArray[np.uint64]], steps: Steps
+) -> Levels:
+    """Log-odds steps (N, 512) that the cells of N blocks got; UNKNOWN: no ray.
+
+    `before`, `after` (N, 512) are the map's log-odds; `bits` = (crossed, hit), (N, 8) each.
+    """
+    found = np.empty(after.shape, np.int8)
+    widest = min(steps.highest - steps.lowest, -UNKNOWN - 1)
+    _evidence(before, after, bits, np.array([steps.lowest, steps.highest, widest], np.int16), found)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class PackedEvidence:
+    """Evidence of `count` blocks, compressed."""
+
+    count: int
+    codes: bytes
+    listed: bytes
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of memory, estimated."""
+        return len(self.codes) + len(self.listed) + 150
+
+
+def pack(values: Levels, steps: Steps) -> PackedEvidence:
+    """Compress evidence (N, 512). What lies between the lower clamp and 0 is rounded to two levels."""
+    codes, listed = np.empty((len(values), _PACKED), np.uint8), np.empty(values.size, np.int8)
+    count = _pack(values, steps.lowest, codes, listed)
+    return PackedEvidence(len(values), _deflate(codes), _deflate(listed[:count]))
+
+
+def unpack(packed: PackedEvidence, steps: Steps) -> Levels:
+    """Evidence (N, 512)."""
+    codes = np.frombuffer(bytearray(zlib.decompress(packed.codes, -zlib.MAX_WBITS)), np.uint8)
+    listed = np.frombuffer(bytearray(zlib.decompress(packed.listed, -zlib.MAX_WBITS)), np.int8)
+    values = np.empty((packed.count, CELLS), np.int8)
+    _unpack(codes.reshape(-1, _PACKED), listed, np.array([_weak(steps), steps.lowest], np.int8), values)
+    return values
+
+
+def added(levels: Levels, values: Levels, clamps: tuple[int, int]) -> Levels:
+    """Log-odds (N, 512) with evidence (N, 512) added; `clamps` = (lowest, highest), UNKNOWN adds nothing."""
+    total = np.empty_like(levels)
+    bounds = np.array([max(clamps[0], UNKNOWN + 1), min(clamps[1], -UNKNOWN - 1)], np.int16)
+    _add(levels.reshape(-1), values.reshape(-1), bounds, total.reshape(-1))
+    return total
+
+
+def _weak(steps: Steps) -> int:
+    return min(-1, round(steps.lowest / 4))
+
+
+def _deflate(array: NDArray[np.generic]) -> bytes:
+    packer = zlib.compressobj(1, zlib.DEFLATED, -zlib.MAX_WBITS, 9, zlib.Z_RLE)  # strings hardly come twice
+    return packer.compress(array.tobytes()) + packer.flush()
+
+
+@njit(cache=True, nogil=True)
+def _evidence(before, after, bits, clamps, found):  # type: ignore[no-untyped-def]
+    crossed, struck = bits
+    lowest, highest, widest = clamps[0], clamps[1], clamps[2]
+    unknown = np.int8(UNKNOWN)
+    for n in range(after.shape[0]):
+        for w in range(WORDS):
+            seen, hits = crossed[n, w] | struck[n, w], struck[n, w]
+            cells = slice(64 * w, 64 * (w + 1))
+            out, was, now = found[n, cells], before[n, cells], after[n, cells]
+            out[:] = unknown
+            for b in range(64 if seen != u64(0) else 0):
+                if not (seen >> u64(b)) & u64(1) or now[b] == unknown:
+                    continue
+                new = i16(now[b])
+                change = new if was[b] == unknown else i16(new - i16(was[b]))
+                if (hits >> u64(b)) & u64(1):
+                    amount = max(change, i16(highest // 2)) if new >= highest else change
+                else:
+                    amount = min(change, lowest) if new <= lowest else min(change, i16(-1))
+                out[b] = np.int8(min(max(amount, i16(-widest)), widest))
+
+
+@njit(cache=True, nogil=True)
+def _add(levels, values, bounds, total):  # type: ignore[no-untyped-def]
+    unknown = np.int8(UNKNOWN)
+    for c in range(u64(levels.size)):
+        level = i16(0) if levels[c] == unknown else i16(levels[c])
+        level = i16(level + i16(values[c]))
+        level = bounds[0] if level < bounds[0] else level
+        level = bounds[1] if level > bounds[1] else level
+        total[c] = levels[c] if values[c] == unknown else np.int8(level)
+
+
+@njit(cache=True, nogil=True)
+def _pack(values, lowest, codes, listed):  # type: ignore[no-untyped-def]
+    count = 0
+    for n in range(values.shape[0]):
+        for k in range(_PACKED):
+            byte = 0
+            for j in range(4):
+                value = i64(values[n, 4 * k + j])
+                code = 0
+                if value != UNKNOWN:
+                    code = _LISTED
+                    if lowest <= value < 0:
+                        code = _STRONG if 2 * value <= lowest else _WEAK
+                    else:
+                        listed[count] = value
+                        count += 1
+                byte |= code << (2 * j)
+            codes[n, k] = byte
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _unpack(codes, listed, levels, values):  # type: ignore[no-untyped-def]
+    """`levels` = (weak, strong)."""
+    table = np.empty((256, 4), np.int8)
+    for byte in range(256):
+        for j in range(4):
+            code = (byte >> (2 * j)) & 3
+            table[byte, j] = np.int8(UNKNOWN) if code == 0 else levels[min(code, _STRONG) - 1]
+    words = table.view(np.uint32)
+    lines = values.view(np.uint32)
+    taken = 0
+    for n in range(codes.shape[0]):
+        for k in range(_PACKED):
+            byte = codes[n, k]
+            lines[n, k] = words[byte, 0]
+            if byte & (byte >> u8(1)) & u8(0x55):
+                for j in range(4):
+                    if (byte >> u8(2 * j)) & u8(3) == _LISTED:
+                        values[n, 4 * k + j] = listed[taken]
+                        taken += 1
