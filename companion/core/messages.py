@@ -151,6 +151,19 @@ class SmoothedState:
     factors: int  # alive in the smoother
 
 
+@message
+class PoseCorrections:
+    """Where poses of the past belong, the newest word on all of the flight.
+
+    Only how they lie to each other counts: the newest of them does not move in `odom`.
+    """
+
+    stamp_ns: int
+    stamps_ns: NDArray[np.int64]  # of the corrected poses, ascending, (K,)
+    p_odom: Array  # (K, 3)
+    q_odom_body: Array  # (K, 4)
+
+
 # --- mapping ------------------------------------------------------------------------
 
 

@@ -41,6 +41,7 @@ LIKELIHOOD = Topic("estimation/likelihood", m.PoseLikelihood, 25.0, "all")
 REGISTERED = Topic("estimation/registered_scan", m.RegisteredScan, 10.0, recorded=False, service="bulk")
 ODOMETRY = Topic("estimation/odometry", m.Odometry, 100.0, deadline_s=0.2, service="control")
 SMOOTHED = Topic("estimation/smoothed", m.SmoothedState, 10.0)
+CORRECTIONS = Topic("estimation/corrections", m.PoseCorrections, 0.0, service="latched")
 # mapping
 LOCAL_MAP = Topic("mapping/local_map", m.LocalMap, 5.0, recorded=False, deadline_s=1.0, service="bulk")
 MAP_STATUS = Topic("mapping/status", m.MapStatus, 5.0, deadline_s=1.0)

@@ -8,11 +8,13 @@ import msgspec
 import numpy as np
 
 from companion.core.geometry import rotation_from_quaternion
-from companion.core.messages import Array, MapStatus, RegisteredScan
+from companion.core.messages import Array, MapStatus, PoseCorrections, RegisteredScan, Why
 from companion.core.node import Node, Outputs, on
 from companion.core.rig import Rig
-from companion.core.topics import LOCAL_MAP, MAP_DELTA, MAP_FULL, MAP_STATUS, OCCUPIED, REGISTERED
+from companion.core.topics import CORRECTIONS, LOCAL_MAP, MAP_DELTA, MAP_FULL, MAP_STATUS, OCCUPIED, REGISTERED, WHY
+from companion.mapping.correction import warm_correction
 from companion.mapping.distance_field import DistanceField, FieldConfig
+from companion.mapping.follow import FollowConfig, MapFollower
 from companion.mapping.free_volume import cells_around
 from companion.mapping.share import MapShare, ShareConfig, warm_share
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
@@ -25,6 +27,7 @@ class MappingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     voxels: VoxelMapConfig = VoxelMapConfig()
     field: FieldConfig = FieldConfig()
+    follow: FollowConfig = FollowConfig()
     share: ShareConfig = ShareConfig()
     map_every: Annotated[int, msgspec.Meta(ge=1)] = 2  # scans per local map
     own_radius_m: _Metres = 0.35  # returns nearer to the body's origin are the vehicle itself
@@ -41,7 +44,7 @@ class MappingNode(Node):
     count scans that were left out: pose not finite, stamp not newer than the last.
     """
 
-    publishes = (LOCAL_MAP, MAP_STATUS, OCCUPIED, MAP_DELTA, MAP_FULL)
+    publishes = (LOCAL_MAP, MAP_STATUS, OCCUPIED, MAP_DELTA, MAP_FULL, WHY)
 
     def __init__(self, config: MappingConfig, rig: Rig, *, hull_radius_m: float) -> None:
         self.config = config
@@ -50,6 +53,7 @@ class MappingNode(Node):
         self.voxels = VoxelMap(config.voxels)
         self.scans = self.skipped_pose = self.skipped_stamp = 0
         self._field = DistanceField(config.field, resolution_m=config.voxels.resolution_m)
+        self.follower = MapFollower(config.follow, self.voxels)
         self._share = MapShare(config.share)
         self._newest_ns = -1
         self._compile()
@@ -74,12 +78,25 @@ class MappingNode(Node):
             free_odom=self._filled_by_vehicle(scan.p_odom),
             own_radius_m=self.config.own_radius_m,
             stamp_ns=scan.stamp_ns,
+            watch=self.follower.watch,
         )
+        yield from self._follow(scan)
         if self.scans % self.config.map_every == 0:
             yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
             yield MAP_STATUS(MapStatus(stamp_ns=scan.stamp_ns, scans=self.scans + 1, blocks=self.voxels.block_count))
         self.scans += 1
         yield from self._share.after_scan(self.voxels, scan.p_odom, stamp_ns=scan.stamp_ns)
+
+    @on(CORRECTIONS)
+    def correct(self, corrections: PoseCorrections) -> None:
+        """Let the map follow, a step with each scan from now on."""
+        self.follower.take(corrections)
+
+    def _follow(self, scan: RegisteredScan) -> Outputs:
+        done = self.follower.after_scan(scan.stamp_ns, scan.p_odom, scan.q_odom_body)
+        if done:
+            what = f"corrected the map: {done.moved} of {done.moved + done.stayed} stretches of the flight moved"
+            yield WHY(Why(stamp_ns=scan.stamp_ns, node="mapping", what=what, because="past poses were corrected"))
 
     def _filled_by_vehicle(self, p_odom: Array) -> Array:
         """Centres (K, 3) of the cells that are free because the vehicle is, or starts, there."""
@@ -95,6 +112,7 @@ class MappingNode(Node):
         self.voxels.insert(np.empty((0, 3), np.float32), R_odom_body=np.eye(3), p_odom=zero, origin_odom=zero)
         self._field.around(self.voxels, zero, 0)
         warm_share(self.voxels)
+        warm_correction(self.config.voxels)
 
 
 def _usable(scan: RegisteredScan) -> bool:

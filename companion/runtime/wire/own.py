@@ -24,6 +24,7 @@ PACKAGE = "understory_msgs"
 FRAMES: dict[type[Any], str] = {  # header.frame_id, where there is one
     **dict.fromkeys((m.LioState, m.PoseLikelihood, m.Odometry, m.LocalMap, m.MapDelta, m.Goal), "odom"),
     **dict.fromkeys((m.Trajectory, m.PlanStatus, m.Setpoint, m.VehicleStatus), "odom"),
+    m.PoseCorrections: "odom",
     m.RegisteredScan: "base_link",
     m.SmoothedState: "map",
     m.GroundTruth: "world",
@@ -82,6 +83,8 @@ class _Source:
             back = f"{back}.view('{'f4' if base.endswith('32') else 'f8'}').reshape(-1, 3)"
         elif self._hints[name] is bytes:
             back = f"{back}.tobytes()"
+        elif name == "q_odom_body":  # several; a single one is a Quaternion
+            back = f"{back}.reshape(-1, 4)"
         elif name in _MATRICES:
             back = f"{back}.reshape{_MATRICES[name]}"
         elif self._kind is m.LocalMap and name in _GRIDS:

@@ -94,10 +94,12 @@ def _random(kind: type[Any], name: str, hint: Any, rng: np.random.Generator) -> 
         return _message(hint, rng)  # type: ignore[arg-type]
     shape = (7, 3) if (kind, name) == (m.Trajectory, "p_odom") else FIXED.get(name, (3,))
     shape = (4,) if name.startswith("q_") else shape
+    if kind is m.PoseCorrections and name != "stamps_ns":
+        shape = (7, *shape[-1:])
     values = rng.normal(size=shape)
     if values.size:
         values.flat[0] = math.nan
     dtype = {"Array32": np.float32, "Bytes2D": np.uint8}.get("")
     del dtype
     scalar = typing.get_args(typing.get_args(hint)[1])[0] if typing.get_args(hint) else np.float64
-    return rng.integers(0, 3, shape).astype(scalar) if scalar is np.uint8 else values.astype(scalar)
+    return rng.integers(0, 3, shape).astype(scalar) if issubclass(scalar, np.integer) else values.astype(scalar)
