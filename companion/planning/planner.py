@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from companion.core.messages import Array
 from companion.planning.space import Space
 
-PlannerName = Literal["rrt_star", "dijkstra", "astar", "theta_star"]
+PlannerName = Literal["rrt_star", "rrt", "rrt_connect", "prm", "prm_star", "dijkstra", "astar", "theta_star"]
 Proof = Literal["", "optimal", "infeasible"]
 
 

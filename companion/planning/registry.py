@@ -12,6 +12,8 @@ import msgspec
 from companion.core.errors import InputError
 from companion.planning.lattice.planner import AStar, Dijkstra, LatticeConfig, ThetaStar
 from companion.planning.planner import Planner
+from companion.planning.roadmap import PRM, PRMStar, RoadmapConfig
+from companion.planning.rrt import RRT, RRTConfig, RRTConnect
 from companion.planning.rrt_star import RRTStar, RRTStarConfig
 
 
@@ -19,11 +21,17 @@ class PlannerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Settings of every planner, also of those that do not fly."""
 
     rrt_star: RRTStarConfig = RRTStarConfig()
+    rrt: RRTConfig = RRTConfig()
+    roadmap: RoadmapConfig = RoadmapConfig()
     lattice: LatticeConfig = LatticeConfig()
 
 
 PLANNERS: dict[str, Callable[[PlannerSettings], Planner]] = {
     "rrt_star": lambda settings: RRTStar(settings.rrt_star),
+    "rrt": lambda settings: RRT(settings.rrt),
+    "rrt_connect": lambda settings: RRTConnect(settings.rrt),
+    "prm": lambda settings: PRM(settings.roadmap),
+    "prm_star": lambda settings: PRMStar(settings.roadmap),
     "dijkstra": lambda settings: Dijkstra(settings.lattice),
     "astar": lambda settings: AStar(settings.lattice),
     "theta_star": lambda settings: ThetaStar(settings.lattice),

@@ -12,7 +12,7 @@ from numba import njit
 RING = 512
 PER_CELL = 16  # buckets
 USED, FREE, SIZE, BUCKET = range(4)  # of state: entries ever used, first freed one, entries in the list, bucket now
-_ROOM = 32  # more than a node has neighbours
+ROOM = 32  # more than a cell has neighbours
 
 
 @njit(cache=True, nogil=True)
@@ -24,11 +24,11 @@ def empty_list():  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def with_room(pool, state):  # type: ignore[no-untyped-def]
-    """The pool, or a larger copy, with room for all neighbours of a node."""
-    if state[USED] + _ROOM <= pool.shape[0]:
+def with_room(pool, state, more):  # type: ignore[no-untyped-def]
+    """The pool, or a larger copy, with room for `more` nodes."""
+    if state[USED] + more <= pool.shape[0]:
         return pool
-    larger = np.empty((2 * pool.shape[0], 2), np.int32)
+    larger = np.empty((2 * pool.shape[0] + more, 2), np.int32)
     for n in range(pool.shape[0]):
         larger[n, 0], larger[n, 1] = pool[n, 0], pool[n, 1]
     return larger

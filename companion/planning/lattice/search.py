@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from companion.planning.lattice.heuristics import estimate
-from companion.planning.lattice.open_list import BUCKET, PER_CELL, empty_list, pop, push, with_room
+from companion.planning.lattice.open_list import BUCKET, PER_CELL, ROOM, empty_list, pop, push, with_room
 
 CLOSED = 64
 NEVER = 1e30
@@ -49,7 +49,7 @@ def search(blocked, shape, moves, ends, bound, label, cost):  # type: ignore[no-
         if cost[v] + bound[1] * _bound_at(bound[0], at, to) >= best - SAME:
             continue
         expanded += 1
-        pool = with_room(pool, state)
+        pool = with_room(pool, state, ROOM)
         seen = with_space(seen, count)
         walls = surroundings(blocked, v, shape)
         left = (at[0] - to[0], at[1] - to[1], at[2] - to[2])
@@ -124,7 +124,7 @@ def _bound_at(kind, p, q):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def with_space(nodes, count):  # type: ignore[no-untyped-def]
     """The list, or a longer copy, with space for all neighbours of a node."""
-    if count + 32 <= len(nodes):
+    if count + ROOM <= len(nodes):
         return nodes
     larger = np.empty(2 * len(nodes), nodes.dtype)
     for n in range(len(nodes)):

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from companion.planning.grid import segment_free
-from companion.planning.lattice.open_list import BUCKET, PER_CELL, empty_list, pop, push, with_room
+from companion.planning.lattice.open_list import BUCKET, PER_CELL, ROOM, empty_list, pop, push, with_room
 from companion.planning.lattice.search import CLOSED, NEVER, SAME, surroundings, unflat, with_space
 
 SEEN = 1
@@ -41,7 +41,7 @@ def theta_star(blocked, shape, moves, ends, places, steps, label, cost, parent):
         if v == goal:
             return expanded, seen[:count]
         expanded += 1
-        pool = with_room(pool, state)
+        pool = with_room(pool, state, ROOM)
         seen = with_space(seen, count)
         walls = surroundings(blocked, v, shape)
         _put(parent[v], shape, ends, places, points[0])
