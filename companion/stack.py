@@ -9,6 +9,7 @@ from companion.config import Config
 from companion.core.node import Node
 from companion.estimation.node import GraphNode, LioNode, PropagatorNode
 from companion.estimation.warm_up import warm_up
+from companion.mapping.landmark_node import LandmarkNode
 from companion.mapping.node import MappingNode
 from companion.mission.model import Mission
 from companion.mission.node import MissionNode
@@ -18,15 +19,15 @@ from companion.sensors.node import SensorsNode
 from companion.tracking.node import TrackingNode
 
 NODES = (
-    SensorsNode, LioNode, PropagatorNode, GraphNode, MappingNode, PlanningNode, TrackingNode, MissionNode,
-    SafetyNode, AutopilotNode,
+    SensorsNode, LioNode, PropagatorNode, GraphNode, MappingNode, LandmarkNode, PlanningNode, TrackingNode,
+    MissionNode, SafetyNode, AutopilotNode,
 )  # fmt: skip
 
 GROUPS: dict[str, tuple[type[Node], ...]] = {
     # One process each when the stack runs live: what control needs at once runs where control runs.
     "perception": (SensorsNode, LioNode),
     "graph": (GraphNode,),
-    "world": (MappingNode, PlanningNode),
+    "world": (MappingNode, LandmarkNode, PlanningNode),  # the local map is too large to leave its process
     "control": (PropagatorNode, TrackingNode, MissionNode, SafetyNode, AutopilotNode),
 }
 
@@ -46,6 +47,7 @@ def build(
         PropagatorNode: lambda: PropagatorNode(config.estimation),
         GraphNode: lambda: GraphNode(config.estimation, config.rig),
         MappingNode: lambda: MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m),
+        LandmarkNode: lambda: LandmarkNode(config.mapping.landmarks, config.rig),
         PlanningNode: lambda: PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),
         TrackingNode: lambda: TrackingNode(config.tracking),
         MissionNode: lambda: MissionNode(mission, config.mission),

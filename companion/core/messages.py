@@ -181,6 +181,19 @@ class LocalMap:
 
 
 @message
+class Landmarks:
+    """Single things of the feature map, one row each, ordered by id."""
+
+    stamp_ns: int  # of the newest image inside
+    id: NDArray[np.int64]  # (N,), never given twice
+    position_odom: Array  # m, (N, 3); of a trunk: its axis at breast height
+    sigma_m: Array  # root of the mean variance of the three axes, (N,)
+    kind: NDArray[np.uint8]  # 0 visual, 1 trunk, (N,)
+    radius_m: Array  # NaN: has none, (N,)
+    observations: NDArray[np.int64]  # (N,)
+
+
+@message
 class MapStatus:
     """How old and how large the map is: for whoever needs no cells."""
 

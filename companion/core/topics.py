@@ -45,6 +45,7 @@ CORRECTIONS = Topic("estimation/corrections", m.PoseCorrections, 0.0, service="l
 # mapping
 LOCAL_MAP = Topic("mapping/local_map", m.LocalMap, 5.0, recorded=False, deadline_s=1.0, service="bulk")
 MAP_STATUS = Topic("mapping/status", m.MapStatus, 5.0, deadline_s=1.0)
+LANDMARKS = Topic("mapping/landmarks", m.Landmarks, 0.2, recorded=False, service="bulk")
 OCCUPIED = Topic(
     "mapping/occupied",
     m.OccupiedVoxels,

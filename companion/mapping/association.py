@@ -119,14 +119,14 @@ class _Pairs:
 def _gated(landmarks: NDArray[Any], seen: Observations, config: AssociationConfig) -> _Pairs:
     """cost = d' S^-1 d + ln(|S| / |R|) + weight * differing bits, S = P + R."""
     i, j = _within_reach(landmarks, seen, config.chi2_gate)
-    same = landmarks["kind"][j] == seen.kind[i]
-    i, j = i[same], j[same]
+    bits = np.bitwise_count(landmarks["descriptor"][j] ^ seen.descriptor[i]).sum(axis=1, dtype=np.int64)
+    alike = (landmarks["kind"][j] == seen.kind[i]) & (bits <= config.hamming_gate)
+    i, j, bits = i[alike], j[alike], bits[alike]
     S = landmarks["covariance"][j] + seen.covariance[i]
     d = seen.position_odom[i] - landmarks["position_odom"][j]
     chi2 = (d * np.linalg.solve(S, d[:, :, None])[:, :, 0]).sum(axis=1)
-    bits = np.bitwise_count(landmarks["descriptor"][j] ^ seen.descriptor[i]).sum(axis=1, dtype=np.int64)
-    widening = np.linalg.slogdet(S)[1] - np.linalg.slogdet(seen.covariance)[1][i]
-    inside = (chi2 <= config.chi2_gate) & (bits <= config.hamming_gate)
+    widening = np.log(np.linalg.det(S) / np.linalg.det(seen.covariance)[i])
+    inside = chi2 <= config.chi2_gate
     cost = chi2 + widening + config.hamming_weight * bits
     widest = np.zeros(len(seen))
     np.maximum.at(widest, i, widening)
@@ -150,18 +150,18 @@ def _within_reach(landmarks: NDArray[Any], seen: Observations, chi2_gate: float)
 
 
 def _assign(pairs: _Pairs, observations: int, landmarks: int, ambiguity: float) -> Rows:
-    """Cluster by cluster of observations that share landmarks."""
+    """Cluster by cluster of observations that share landmarks; most pairs are alone."""
     found = np.full(observations, NEW, np.int64)
-    if len(pairs.cost) == 0:
-        return found
-    size = observations + landmarks
-    graph = coo_array((np.ones(len(pairs.cost)), (pairs.seen, observations + pairs.row)), shape=(size, size))
-    cluster = connected_components(graph, directed=False)[1][pairs.seen]
-    alone = np.bincount(cluster)[cluster] == 1  # nobody else wants either: most are
+    alone = (np.bincount(pairs.seen)[pairs.seen] == 1) & (np.bincount(pairs.row)[pairs.row] == 1)
     found[pairs.seen[alone]] = pairs.row[alone]
     crowded = np.flatnonzero(~alone)
     if len(crowded) == 0:
         return found
+    ends = pairs.seen[crowded], observations + pairs.row[crowded]
+    size = observations + landmarks
+    graph = coo_array((np.ones(len(crowded)), ends), shape=(size, size))
+    cluster = np.zeros(len(pairs.cost), np.int64)
+    cluster[crowded] = connected_components(graph, directed=False)[1][ends[0]]
     order = crowded[np.argsort(cluster[crowded], kind="stable")]
     for part in np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1):
         seen, a = np.unique(pairs.seen[part], return_inverse=True)

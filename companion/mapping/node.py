@@ -16,6 +16,7 @@ from companion.mapping.correction import warm_correction
 from companion.mapping.distance_field import DistanceField, FieldConfig
 from companion.mapping.follow import FollowConfig, MapFollower
 from companion.mapping.free_volume import cells_around
+from companion.mapping.landmark_node import LandmarkConfig
 from companion.mapping.share import MapShare, ShareConfig, warm_share
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 
@@ -29,6 +30,7 @@ class MappingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     field: FieldConfig = FieldConfig()
     follow: FollowConfig = FollowConfig()
     share: ShareConfig = ShareConfig()
+    landmarks: LandmarkConfig = LandmarkConfig()  # of LandmarkNode
     map_every: Annotated[int, msgspec.Meta(ge=1)] = 2  # scans per local map
     own_radius_m: _Metres = 0.35  # returns nearer to the body's origin are the vehicle itself
     start_free_radius_m: _Metres = 0.7  # sphere that is free at the first scan: nothing touches the rotors

@@ -53,9 +53,9 @@ def trunks(local_map: LocalMap, center_odom: Array, config: TrunkConfig) -> Trun
     box = _crop(local_map, center_odom, config)
     heights = np.arange(*config.extent_m, local_map.resolution_m)
     occupied = _at_heights(box, heights)
-    at_breast = _at_heights(box, np.arange(*config.slice_m, local_map.resolution_m)).any(axis=2)
+    at_breast = (heights >= config.slice_m[0]) & (heights < config.slice_m[1])
     counts = occupied.sum(axis=2)
-    strong = at_breast & (counts >= config.column_share * len(heights))
+    strong = occupied[:, :, at_breast].any(axis=2) & (counts >= config.column_share * len(heights))
     labels, number = ndimage.label(strong, np.ones((3, 3)))
     found = [
         _measure(box, cells, counts)
@@ -101,11 +101,13 @@ def _filled(ground: Array, gap_cells: float) -> Array:
 
 def _at_heights(box: _Box, heights_m: Array) -> NDArray[np.bool_]:
     """Which columns are occupied at heights (S,) above their ground: (X, Y, S)."""
-    levels = (box.ground_z[:, :, None] + heights_m - box.corner_odom[2]) / box.cell_m
+    occupied = np.zeros((*box.ground_z.shape, len(heights_m)), np.bool_)
+    x, y = np.nonzero((box.state == OCCUPIED_CELL).any(axis=2) & np.isfinite(box.ground_z))
+    levels = (box.ground_z[x, y, None] + heights_m - box.corner_odom[2]) / box.cell_m
     inside = (levels >= 0.0) & (levels < box.state.shape[2])
     index = np.where(inside, levels, 0.0).astype(np.int64)
-    state = np.take_along_axis(box.state, index, axis=2)
-    return np.asarray(inside & (state == OCCUPIED_CELL))
+    occupied[x, y] = inside & (box.state[x[:, None], y[:, None], index] == OCCUPIED_CELL)
+    return occupied
 
 
 def _clusters(labels: NDArray[np.int32], number: int) -> list[NDArray[np.int64]]:

@@ -6,6 +6,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,17 @@ import numpy as np
 import companion
 from companion.core.errors import InputError
 from companion.core.node import Node
+from companion.mapping.feature_map import FeatureMap
 from companion.mapping.formats.octomap import read_octomap, write_bt, write_ot
 from companion.mapping.formats.points import write_pcd, write_ply
 from companion.mapping.formats.stored_map import StoredMap, stored
 from companion.mapping.formats.umap import Progress, pack, unpack
+from companion.mapping.landmark_node import LandmarkNode
 from companion.mapping.node import MappingNode
 from companion.mapping.sensor_model import SensorModel
 
 MAP_FILE = "map.umap"  # in the folder of a flight
+FEATURES = "features"  # section with the landmarks
 READABLE = (".umap", ".bt", ".ot", ".npz")
 _WRITERS: dict[str, Callable[[StoredMap], bytes]] = {
     ".bt": write_bt,
@@ -32,10 +36,21 @@ WRITABLE = (".umap", *_WRITERS)
 
 
 def save_map(path: Path, nodes: Sequence[Node]) -> None:
-    """Write `path` (.umap) if the map is among the nodes."""
+    """Write `path` (.umap) if the map is among the nodes, with the landmarks if those are, too."""
+    sections: dict[str, bytes] = {}
+    for node in nodes:
+        if isinstance(node, LandmarkNode):
+            sections[FEATURES] = node.features.to_bytes()
     for node in nodes:
         if isinstance(node, MappingNode):
-            write_map(path, stored(node.voxels, created_by=f"understory {companion.__version__}"))
+            created_by = f"understory {companion.__version__}"
+            write_map(path, stored(node.voxels, created_by=created_by, sections=sections))
+
+
+def features_of(stored_map: StoredMap) -> FeatureMap | None:
+    """The landmarks in a map's file, None if it has none; InputError if they are damaged."""
+    data = stored_map.sections.get(FEATURES)
+    return None if data is None else FeatureMap.from_bytes(data)
 
 
 def read_map(path: Path, *, sensor: SensorModel | None = None, on_progress: Progress | None = None) -> StoredMap:
@@ -53,7 +68,7 @@ def read_map(path: Path, *, sensor: SensorModel | None = None, on_progress: Prog
     if suffix == ".umap":
         return unpack(data, file=str(path), on_progress=on_progress)
     if suffix == ".npz":
-        return _read_npz(path)
+        return _read_npz(data, str(path))
     return read_octomap(data, file=str(path), sensor=sensor)
 
 
@@ -97,10 +112,10 @@ def _suffix(path: Path, valid: Sequence[str]) -> str:
     return suffix
 
 
-def _read_npz(path: Path) -> StoredMap:
+def _read_npz(data: bytes, file: str) -> StoredMap:
     """`map.npz` of flights before `.umap`."""
     try:
-        with np.load(path) as arrays:
+        with np.load(BytesIO(data)) as arrays:
             hit, miss, lowest, highest = (float(v) for v in arrays["sensor_model"])
             return StoredMap(
                 resolution_m=float(arrays["resolution_m"]),
@@ -110,6 +125,6 @@ def _read_npz(path: Path) -> StoredMap:
                 created_by="understory 0.1.0",
             ).canonical()
     except InputError as error:
-        raise InputError(error.problem, file=str(path), field=error.field, valid=error.valid) from error
+        raise InputError(error.problem, file=file, field=error.field, valid=error.valid) from error
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError("no map of an old flight", file=str(path), valid="map.npz of a flight") from error
+        raise InputError("no map of an old flight", file=file, valid="map.npz of a flight") from error

@@ -24,6 +24,7 @@ PACKAGE = "understory_msgs"
 FRAMES: dict[type[Any], str] = {  # header.frame_id, where there is one
     **dict.fromkeys((m.LioState, m.PoseLikelihood, m.Odometry, m.LocalMap, m.MapDelta, m.Goal), "odom"),
     **dict.fromkeys((m.Trajectory, m.PlanStatus, m.Setpoint, m.VehicleStatus), "odom"),
+    m.Landmarks: "odom",
     m.PoseCorrections: "odom",
     m.RegisteredScan: "base_link",
     m.SmoothedState: "map",

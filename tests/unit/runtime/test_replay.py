@@ -201,7 +201,7 @@ def test_without_recorded_sensors_the_other_nodes_are_replayed(flight, tmp_path)
     log = without_payloads(flight / "flight.log", tmp_path / "a.log", lambda _, topic: BY_NAME[topic].recorded)
     replay = run(log)
     assert replay.identical
-    assert list(replay.blocked) == ["SensorsNode", "LioNode", "MappingNode", "PlanningNode"]
+    assert list(replay.blocked) == ["SensorsNode", "LioNode", "MappingNode", "LandmarkNode", "PlanningNode"]
     assert replay.blocked["PlanningNode"] == ("mapping/local_map", "MappingNode")
     assert list(replay.reports) == [k.__name__ for k in NODES if k.__name__ not in replay.blocked]
     with pytest.raises(InputError, match="--record"):
