@@ -181,6 +181,8 @@ class PRM:
 
     def __init__(self, config: RoadmapConfig) -> None:
         self.config = config
+        self.roadmap: Roadmap | None = None
+        """Of the last plan."""
 
     def plan(
         self,
@@ -200,6 +202,7 @@ class PRM:
             straight = np.stack([start, goal])
             return Plan(path=straight, cost_m=length(straight), iterations=0, solved=True)
         roadmap = build_roadmap(space, rng=rng, samples=iterations, config=self.config, star=self.star, more=known_path)
+        self.roadmap = roadmap
         return replace(roadmap.query(start, goal, space), iterations=iterations)
 
 

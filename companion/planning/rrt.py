@@ -21,7 +21,7 @@ from companion.planning import connect as two_trees
 from companion.planning.grid import segment_free
 from companion.planning.planner import CellSpace, Plan, refused
 from companion.planning.polyline import length, without_repeats
-from companion.planning.tree import COST, add, gap, nearest, way_to
+from companion.planning.tree import COST, PARENT, add, gap, nearest, way_to
 
 _CHUNK = 20  # iterations between two looks whether there is a path
 _DRAWS = 4  # uniforms per iteration of RRT
@@ -44,6 +44,11 @@ class RRT:
 
     def __init__(self, config: RRTConfig) -> None:
         self.config = config
+        self._last: tuple[_Trees, list[int], CellSpace] | None = None
+
+    def edges(self) -> Array:
+        """All edges (E, 2, 3) of the last plan's search, odom, m: for pictures."""
+        return _edges(*self._last) if self._last else np.empty((0, 2, 3))
 
     def plan(
         self,
@@ -68,6 +73,7 @@ class RRT:
             draws = rng.random((min(_CHUNK, iterations - done), _DRAWS))
             count, used, joined = _grow(space.steps, *tree, count, ends[1], space.sample_box, draws, settings)
             done += used
+        self._last = trees, [count], space
         last = count - 1 if joined else int(np.argmin(np.linalg.norm(tree[0][:count, :3] - ends[1], axis=1)))
         return _plan(space, trees, last, (start, goal), done, joined)
 
@@ -77,6 +83,11 @@ class RRTConnect:
 
     def __init__(self, config: RRTConfig) -> None:
         self.config = config
+        self._last: tuple[_Trees, list[int], CellSpace] | None = None
+
+    def edges(self) -> Array:
+        """All edges (E, 2, 3) of the last plan's search, odom, m: for pictures."""
+        return _edges(*self._last) if self._last else np.empty((0, 2, 3))
 
     def plan(
         self,
@@ -97,15 +108,16 @@ class RRTConnect:
         trees = _Trees.of(2, iterations * reach, space, self.config)
         for which in (0, 1):
             trees.plant(which, ends[which])
-        counts, path, done = np.array([1, 1]), np.zeros((4096, 3)), 0
-        while done < iterations:
+        counts, path, done, points = np.array([1, 1]), np.zeros((4096, 3)), 0, 0
+        while done < iterations and not points:
             draws = rng.random((_CHUNK, two_trees.DRAWS))
             done += _CHUNK
             arguments = (counts, space.sample_box, draws, step, trees.bucket, path)
             points = two_trees.connect(space.steps, trees.nodes, trees.links, trees.heads, *arguments)
-            if points:
-                way = _ended(space.to_odom(without_repeats(path[:points])), start, goal)
-                return Plan(path=way, cost_m=length(way), iterations=done, solved=True)
+        self._last = trees, counts.tolist(), space
+        if points:
+            way = _ended(space.to_odom(without_repeats(path[:points])), start, goal)
+            return Plan(path=way, cost_m=length(way), iterations=done, solved=True)
         last = int(np.argmin(np.linalg.norm(trees.nodes[0, : counts[0], :3] - ends[1], axis=1)))
         return _plan(space, trees, last, (start, goal), done, False)
 
@@ -141,6 +153,15 @@ def _plan(space: CellSpace, trees: _Trees, last: int, ends: tuple[Array, Array],
     if solved:
         path = _ended(path, *ends)
     return Plan(path=path, cost_m=length(path) if solved else math.inf, iterations=done, solved=solved)
+
+
+def _edges(trees: _Trees, counts: list[int], space: CellSpace) -> Array:
+    """All edges (E, 2, 3) of trees with so many nodes, odom, m."""
+    pairs = []
+    for nodes, links, count in zip(trees.nodes, trees.links, counts, strict=True):
+        ends = nodes[1:count, :3], nodes[links[1:count, PARENT], :3]
+        pairs.append(np.stack(ends, axis=1))
+    return space.to_odom(np.concatenate(pairs))
 
 
 def _ended(path: Array, start: Array, goal: Array) -> Array:

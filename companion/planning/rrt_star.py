@@ -18,7 +18,7 @@ from companion.planning import connect as two_trees
 from companion.planning import grow, shortcut
 from companion.planning.planner import CellSpace, Plan, refused
 from companion.planning.polyline import length, without_repeats
-from companion.planning.tree import COST, NEVER, add, way_to
+from companion.planning.tree import COST, NEVER, PARENT, add, way_to
 
 _PATH_POINTS = 2048
 _SPARE_NODES = 2048  # for chains of known and shortened paths
@@ -53,6 +53,11 @@ class RRTStar:
     def __init__(self, config: RRTStarConfig) -> None:
         self.config = config
         self._memory: _Memory | None = None
+        self._last: _Search | None = None
+
+    def edges(self) -> Array:
+        """All edges (E, 2, 3) of the last plan's tree, odom, m: for pictures."""
+        return self._last.edges() if self._last else np.empty((0, 2, 3))
 
     def plan(
         self,
@@ -76,7 +81,7 @@ class RRTStar:
         if space.segment_free(start, goal):
             straight = np.stack([start, goal])
             return Plan(path=straight, cost_m=length(straight), iterations=0, solved=True)
-        search = _Search(self.config, space, self._scratch(space, iterations), start, goal)
+        search = self._last = _Search(self.config, space, self._scratch(space, iterations), start, goal)
         if known_path is not None and len(known_path):
             search.take_known(known_path)
         done = 0
@@ -180,6 +185,12 @@ class _Search:
         count = self._way_to(self._nearest_to_goal())
         path = self._space.to_odom(self._path[: max(count, 1)])
         return Plan(path=path, cost_m=math.inf, iterations=iterations, solved=False)
+
+    def edges(self) -> Array:
+        """Node and parent (E, 2, 3), odom, m."""
+        nodes, links, _ = self._tree
+        hung = np.flatnonzero(links[: int(self._counts[grow.NODES]), PARENT] >= 0)
+        return self._space.to_odom(np.stack([nodes[hung, :3], nodes[links[hung, PARENT], :3]], axis=1))
 
     def _join(self, draws: Array) -> None:
         """RRT-Connect; its start tree lies in the place of RRT*'s, which is empty until there is a path."""

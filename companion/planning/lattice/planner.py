@@ -38,6 +38,8 @@ class AStar:
     def __init__(self, config: LatticeConfig) -> None:
         self.config = config
         self._scratch: Scratch | None = None
+        self.closed = np.empty((0, 3), np.int64)
+        """Expanded cells (K, 3) of the last plan: for pictures."""
 
     def plan(
         self,
@@ -59,6 +61,7 @@ class AStar:
         places = space.to_cells(np.stack([start, goal]))
         lattice = self._lattice(space)
         found = self._search(lattice, places, space)
+        self.closed = found.closed
         path = space.to_odom(found.cells.astype(np.float64) + 0.5)
         path[0] = start
         if found.solved:
