@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from companion.mapping.rays import CELLS
+from companion.mapping.cell_coder import decode, encode
 
 i64 = np.int64
 SHAPE = np.array([8, 8, 4])  # blocks of a region
@@ -54,16 +54,16 @@ def pack(blocks: Mapping[str, NDArray[Any]]) -> ColdRegion:
         changes=(int(blocks["changed_at"].min()), int(blocks["changed_at"].max())),
         held=bool(blocks["held"].any()),
         places=np.packbits(there).tobytes(),
-        log_odds=_deflate(blocks["log_odds"].tobytes()),
-        rest=_deflate(b"".join(planes)),
+        log_odds=encode(places_of(blocks["xyz"]), blocks["log_odds"]),
+        rest=zlib.compress(b"".join(planes), 1),
         layout=tuple((name, array.dtype.str) for name, array in rest.items()),
     )
 
 
 def unpack(region: ColdRegion, key: int) -> Blocks:
     """The blocks that `pack` was given; `key` is the region's."""
-    log_odds = np.frombuffer(zlib.decompress(region.log_odds, -zlib.MAX_WBITS), np.int8)
-    blocks: Blocks = {"xyz": xyz_of(region, key), "log_odds": log_odds.reshape(-1, CELLS)}
+    xyz = xyz_of(region, key)
+    blocks: Blocks = {"xyz": xyz, "log_odds": decode(region.log_odds, places_of(xyz))}
     return blocks | unpack_rest(region)
 
 
@@ -75,7 +75,7 @@ def xyz_of(region: ColdRegion, key: int) -> NDArray[np.int32]:
 
 def unpack_rest(region: ColdRegion) -> Blocks:
     """All arrays but those of positions and log-odds."""
-    data, first = np.frombuffer(zlib.decompress(region.rest, -zlib.MAX_WBITS), np.uint8), 0
+    data, first = np.frombuffer(zlib.decompress(region.rest), np.uint8), 0
     blocks: Blocks = {}
     for name, kind in region.layout:
         size = np.dtype(kind).itemsize
@@ -124,16 +124,6 @@ def all_blocks(key: int) -> NDArray[np.int64]:
 
 def _corner(key: int) -> NDArray[np.int64]:
     return np.asarray(positions_of(np.array([key]))[0] << _SHIFT)
-
-
-def _deflate(data: bytes) -> bytes:
-    """Runs and Huffman codes: beside deflate's search for strings smaller by a fifth, and faster.
-
-    The counts of free looks are noise in which no string comes twice. Measured in
-    `companion.runtime.bench.mapping_memory`.
-    """
-    packer = zlib.compressobj(1, zlib.DEFLATED, -zlib.MAX_WBITS, 9, zlib.Z_RLE)
-    return packer.compress(data) + packer.flush()
 
 
 @njit(cache=True, nogil=True)

@@ -1,12 +1,12 @@
 """What of the map lies compressed: blocks go when they are far, and are back before a ray can meet them.
 
 The map is cut into regions of 8 x 8 x 4 blocks. A region is either in the block store or cold:
-compressed without loss, in memory. Each scan brings back every cold region in the box that its
-rays can reach, so that insertion never knows; then it fetches and puts away a bounded number.
+compressed without loss, in memory. Each scan brings back every cold region that its rays can
+reach, so that insertion never knows; then it fetches and puts away a bounded number.
 
-    need box: all the scan can touch        no cold region in here, ever
-    + keep_m / 2                            cold regions are fetched ahead, nearest first
-    + keep_m                                what is farther is put away, farthest first
+    the ball that rays can reach    no cold region meets it, ever
+    + keep_m / 2                    cold regions are fetched ahead, nearest first
+    + keep_m                        what is farther is put away, farthest first
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Box = tuple[NDArray[np.int64], NDArray[np.int64]]  # lowest block, block beyond 
 class MemoryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How much of the map lies uncompressed, and how large it may become."""
 
-    keep_m: Annotated[float, msgspec.Meta(ge=0.0)] = 12.0  # beyond the longest ray, blocks stay as they are
+    keep_m: Annotated[float, msgspec.Meta(ge=0.0)] = 6.0  # beyond the longest ray, blocks stay as they are
     regions_per_scan: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 16  # put away, and fetched ahead, at most
     budget_mb: Annotated[float, msgspec.Meta(gt=0.0)] = 1024.0
     """Of map, 10^6 bytes. Beyond it, first `keep_m` counts as 0; then cold regions are forgotten:
@@ -68,7 +68,7 @@ class Memory:
         self._cold_bytes = 0
         self._newest = -1  # no cold block changed after this version
         self._asked: Box = (np.zeros(3, np.int64), np.zeros(3, np.int64))
-        self._start: NDArray[np.int64] | None = None  # region of the first scan
+        self._start: NDArray[np.int64] | None = None  # block of the first scan
         self._scarce = False
 
     @property
@@ -81,18 +81,17 @@ class Memory:
         """How many regions are cold."""
         return len(self._cold)
 
-    def before_scan(self, need: Box) -> None:
-        """Make sure that all blocks of the box `need` are in the store; then move a few regions."""
-        here = _middle(need)
+    def before_scan(self, here: NDArray[np.int64], reach: int) -> None:
+        """Bring back all blocks of the ball of `reach` blocks around block `here` (3,); then move a few regions."""
         self._start = here if self._start is None else self._start
         self._scarce = self._total() > self.config.budget_mb * 1e6 * (_RELAXED if self._scarce else 1.0)
-        keep = 0 if self._scarce else self._keep
-        few = self.config.regions_per_scan
-        near = _by_distance(self._cold_in(_grown(need, keep // 2)), here)
-        must = _meets(near, need)
-        self._wake(near[must].tolist())
-        self._wake(near[~must][:few].tolist())
-        moved = self._put_away(_grown(need, keep), few)
+        keep, few = 0 if self._scarce else self._keep, self.config.regions_per_scan
+        near, away = _by_distance(self._cold_in(_around(here, reach + keep // 2)), here)
+        must = int(np.searchsorted(away, reach**2, side="right"))
+        ahead = int(np.searchsorted(away, (reach + keep // 2) ** 2, side="right"))
+        self._wake(near[:must].tolist())
+        self._wake(near[must : min(must + few, ahead)].tolist())
+        moved = self._put_away(here, reach + keep, few)
         if self._scarce and moved < few:
             self._forget(here)
 
@@ -163,12 +162,11 @@ class Memory:
         for key in keys:
             self._blocks.put(unpack(self._drop(key), key), self._lowest)
 
-    def _put_away(self, keep: Box, most: int) -> int:
-        """Compress up to `most` regions that lie wholly outside of `keep` and of what was asked for."""
+    def _put_away(self, here: NDArray[np.int64], keep: int, most: int) -> int:
+        """Compress up to `most` regions, the farthest first, that meet neither the ball nor what was asked for."""
         found = np.empty(self._blocks.count, np.int64)
-        boxes = np.array([_whole_regions(keep), _whole_regions(self._asked)])
-        count = _outside(self._blocks.xyz[: self._blocks.count], boxes, found)
-        keys = _by_distance(np.unique(found[:count]), _middle(keep))[::-1][:most]
+        count = _outside(self._blocks.xyz[: self._blocks.count], here, keep, _whole_regions(self._asked), found)
+        keys = _by_distance(np.unique(found[:count]), here)[0][::-1][:most]
         gone = []
         for key in keys.tolist():
             self._wake([key] if key in self._cold else [])  # someone added blocks to a cold region
@@ -182,7 +180,7 @@ class Memory:
     def _forget(self, here: NDArray[np.int64]) -> None:
         """Drop cold regions until the map fits the budget."""
         start = here if self._start is None else self._start
-        far = _by_distance(np.array(sorted(self._cold), np.int64), here, start)[::-1]
+        far = _by_distance(np.array(sorted(self._cold), np.int64), here, start)[0][::-1]
         for key in sorted(far.tolist(), key=lambda key: self._cold[key].held):  # stable
             if self._total() <= _FORGET_TO * self.config.budget_mb * 1e6:
                 break
@@ -210,13 +208,8 @@ class Memory:
                 yield part, unpack(self._cold[key], key)
 
 
-def _grown(box: Box, blocks: int) -> Box:
-    return box[0] - blocks, box[1] + blocks
-
-
-def _middle(box: Box) -> NDArray[np.int64]:
-    """Position (3,) of the region in the middle."""
-    return regions_of((box[0] + box[1]) // 2)
+def _around(here: NDArray[np.int64], reach: int) -> Box:
+    return here - reach, here + reach + 1
 
 
 def _whole_regions(box: Box) -> Box:
@@ -232,11 +225,16 @@ def _meets(keys: NDArray[np.int64], box: Box) -> NDArray[np.bool_]:
     return np.asarray(np.all((at >= low) & (at < high), axis=1))
 
 
-def _by_distance(keys: NDArray[np.int64], *regions: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Keys of regions, those nearest to any of `regions` first; at the same distance by key."""
-    gaps = [(positions_of(keys) - region) * SHAPE for region in regions]
+def _by_distance(keys: NDArray[np.int64], *places: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Regions, those nearest to any of the blocks `places` first, then by key; and their distances, squared.
+
+    The distance to a region is that to the nearest block that it can have.
+    """
+    low = positions_of(keys) * SHAPE
+    gaps = [np.maximum(np.maximum(low - place, place - low - SHAPE + 1), 0) for place in places]
     away = np.min([np.sum(gap * gap, axis=1) for gap in gaps], axis=0)
-    return keys[np.lexsort((keys, away))]
+    order = np.lexsort((keys, away))
+    return keys[order], away[order]
 
 
 def _same_place(blocks: Blocks, row: NDArray[np.int64], block_xyz: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -255,16 +253,19 @@ def _merged(warm: Blocks | None, cold: Blocks | None) -> Blocks:
 
 
 @njit(cache=True, nogil=True)
-def _outside(xyz, boxes, keys):  # type: ignore[no-untyped-def]
-    """Write the key of the region of each block that is in none of `boxes` (B, 2, 3); returns how many."""
+def _outside(xyz, here, keep, asked, keys):  # type: ignore[no-untyped-def]
+    """Write the key of the region of each block if it meets neither the ball nor the box; returns how many."""
+    low, high = asked
     count = 0
     for n in range(xyz.shape[0]):
-        inside = False
-        for b in range(boxes.shape[0]):
-            low, high = boxes[b, 0], boxes[b, 1]
-            within = low[0] <= xyz[n, 0] < high[0] and low[1] <= xyz[n, 1] < high[1]
-            inside |= within and low[2] <= xyz[n, 2] < high[2]
-        if not inside:
+        away, inside = 0, True
+        for axis in range(3):
+            at, size = np.int64(xyz[n, axis]), SHAPE[axis]
+            first = at - at % size
+            gap = max(first - here[axis], here[axis] - first - size + 1, 0)
+            away += gap * gap
+            inside &= low[axis] <= at < high[axis]
+        if away > keep * keep and not inside:
             keys[count] = region_key(xyz[n, 0], xyz[n, 1], xyz[n, 2])
             count += 1
     return count

@@ -119,7 +119,7 @@ class VoxelMap:
         it holds a return: then one hit. `points_body` (N, 3) are returns, m, and
         `miss_dirs_body` (M, 3) directions of beams without return, both mapped to odom by
         `R_odom_body` (3, 3); `p_odom` (3,) is the body. The voxels of `free_odom` (K, 3), m,
-        are free by other knowledge: one miss. Points nearer to the body's origin than
+        are free by other knowledge, up to `max_range_m`: one miss. Points nearer to the body's origin than
         `own_radius_m`, and what is not finite, is dropped. `stamp_ns` is when the scan was.
         `watch` sees which blocks the scan meets before they change (`companion.mapping.submaps`).
         Raises InputError when the pose is not finite or farther than 100 km.
@@ -130,10 +130,10 @@ class VoxelMap:
         misses = _rows(_NO_VECTORS if miss_dirs_body is None else miss_dirs_body)
         far_m, clear_m = self.config.max_range_m, self.config.miss_clear_range_m
         self._grid.place(origin)
-        self.memory.before_scan((self._grid.corner, self._grid.corner + self._grid.side))
+        self.memory.before_scan(self._grid.corner + self._grid.reach, self._grid.reach)
         hit, steps = self._grid.cast(points, (R, p - origin, origin), (own_radius_m, far_m, False))
         missed, more = self._grid.cast(misses, (R, np.zeros(3), origin), (0.0, clear_m, True))
-        self._grid.mark_free(free_odom)
+        self._grid.mark_free(free_odom[np.linalg.norm(free_odom - origin, axis=1) <= far_m])
         met, changed = self.blocks.fold(self._grid, self.steps, stamp_ns, watch)
         dropped = len(points) + len(misses) - hit - missed
         return Delta(hit, missed, dropped, steps + more, met, changed)
