@@ -110,6 +110,15 @@ class FeatureMap:
             self._drop(order[:surplus])
         return np.asarray(fresh["id"])
 
+    def move(self, R: Array, t: Array) -> None:
+        """Take each landmark to R p + t: rotations (N, 3, 3) and shifts (N, 3), m, one per row."""
+        moved = self.landmarks.copy()
+        moved["position_odom"] = _times(R, self.landmarks["position_odom"]) + t
+        turned = R @ self.landmarks["covariance"] @ R.transpose(0, 2, 1)
+        moved["covariance"] = 0.5 * (turned + turned.transpose(0, 2, 1))
+        self.landmarks = moved
+        self.version += len(moved) > 0
+
     def prune(self, now_ns: int) -> int:
         """Forget what was seen too seldom, and not lately; returns how many."""
         old = now_ns - self.landmarks["last_ns"] > round(self.config.forget_after_s * 1e9)

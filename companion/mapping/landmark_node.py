@@ -9,15 +9,16 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from companion.core.geometry import rotation_from_quaternion
-from companion.core.messages import CameraImage, Landmarks, LocalMap, Odometry
+from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
+from companion.core.messages import CameraImage, Landmarks, LocalMap, Odometry, PoseCorrections
 from companion.core.node import Node, Outputs, on
 from companion.core.rig import Rig
-from companion.core.topics import CAMERA, LANDMARKS, LOCAL_MAP, ODOMETRY
+from companion.core.topics import CAMERA, CORRECTIONS, LANDMARKS, LOCAL_MAP, ODOMETRY
 from companion.mapping.association import TRUNK, VISUAL, Observations
 from companion.mapping.back_projection import BackProjectionConfig, Pose, back_project
 from companion.mapping.feature_map import FeatureMap, FeatureMapConfig
 from companion.mapping.keypoints import KeypointConfig, Keypoints
+from companion.mapping.landmark_correction import LandmarkCorrection
 from companion.mapping.trunks import TrunkConfig, trunks
 
 _Hertz = Annotated[float, msgspec.Meta(gt=0.0, le=30.0)]
@@ -52,6 +53,7 @@ class LandmarkNode(Node):
         self.config, self.rig = config, rig
         self.features = FeatureMap(config.features)
         self.images = self.skipped = 0
+        self.correction = LandmarkCorrection()
         self._keypoints = Keypoints(config.keypoints)
         self._poses: deque[Odometry] = deque(maxlen=_POSES)
         self._map: LocalMap | None = None
@@ -70,6 +72,11 @@ class LandmarkNode(Node):
         """The newest local map."""
         self._map = local_map
 
+    @on(CORRECTIONS)
+    def correct(self, corrections: PoseCorrections) -> None:
+        """Landmarks follow the poses from which they were seen."""
+        self.correction.apply(self.features, corrections)
+
     @on(CAMERA)
     def see(self, image: CameraImage) -> Outputs:
         """Look at the image before this one, if it is time for that."""
@@ -83,6 +90,7 @@ class LandmarkNode(Node):
         if pose is None or self._map is None:
             self.skipped += 1
             return
+        self.correction.looked(before.stamp_ns, pose.p_odom, quaternion_from_rotation(pose.R_odom_body))
         self._observe_ground(before, pose, self._map)
         if self._map.stamp_ns >= self._trunks_due_ns:
             self._trunks_due_ns = self._map.stamp_ns + round(1e9 / self.config.trunk_rate_hz)
