@@ -58,7 +58,10 @@ GROUPS = {  # group -> help, command -> module and function
         "Look into maps, convert, slice and draw them.",
         {"info": "map:info", "convert": "map:convert", "slice": "map:slice_", "view": "map:view"},
     ),
-    "bench": ("Measure this machine.", {"bus": "bench:bus", "mapping": "bench_mapping:mapping"}),
+    "bench": (
+        "Measure this machine.",
+        {"bus": "bench:bus", "mapping": "bench_mapping:mapping", "planners": "bench_planners:planners"},
+    ),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",
         {
