@@ -9,6 +9,7 @@ distances, aligned by a pose graph).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -43,9 +44,10 @@ class Corrected:
     """What a correction did."""
 
     moved: int  # stretches that came to lie elsewhere
-    stayed: int
+    stayed: int  # bit by bit
     blocks: int  # of the map now
     changed: int  # blocks in which a voxel changed its class
+    work: int  # blocks that were moved and added up
 
 
 class Correction:
@@ -61,7 +63,7 @@ class Correction:
         self._voxels, self._submaps, self._poses = voxels, submaps, poses
         self._second = voxels.blank()
         self._second.blocks.version = voxels.version + _LEAP  # whatever is in it counts as changed
-        self._loaded = self._next = self._moved = 0
+        self._loaded = self._next = self._moved = self._work = 0
         self._now: MovedBlocks | None = None
         self._first = 0  # block of `_now` that comes next
         self._last_ns = 0
@@ -107,11 +109,8 @@ class Correction:
         """Move a stretch; its blocks are added by `_add`."""
         shift = self._shift(submap)
         evidence = submap.values(self._voxels.steps) if values is None else values
-        self._now, self._first, self._last_ns = (
-            MovedBlocks(submap.xyz, evidence, shift, self._voxels.resolution_m),
-            0,
-            submap.last_ns,
-        )
+        self._now = MovedBlocks(submap.xyz, evidence, shift, self._voxels.resolution_m)
+        self._first, self._last_ns = 0, submap.last_ns
         self._moved += shift is not _STAY
         self._keep_small()
 
@@ -120,8 +119,9 @@ class Correction:
         memory = self._second.memory
         large = self._second.memory_bytes > 0.5e6 * memory.config.budget_mb
         if self._now is not None and len(self._now.xyz) and (large or memory.cold_regions):
-            xyz = self._now.xyz.astype(np.int64)
-            memory.before_scan((xyz.min(axis=0), xyz.max(axis=0) + 1))
+            low, high = self._now.xyz.min(axis=0).astype(np.int64), self._now.xyz.max(axis=0).astype(np.int64)
+            here = (low + high) // 2
+            memory.before_scan(here, math.ceil(np.linalg.norm(high - here)) + 1)
 
     def _add(self, count: int) -> int:
         """Add up to `count` blocks of the stretch at hand to the second map; returns how many."""
@@ -142,6 +142,7 @@ class Correction:
         blocks.add(xyz[new], levels[new], steps.lowest, held=False)
         blocks.seen_ns[rows] = np.maximum(blocks.seen_ns[rows], self._last_ns)
         self._first = last
+        self._work += last - first
         if last == len(self._now.xyz):
             self._now = None
         return max(last - first, 1)
@@ -156,7 +157,7 @@ class Correction:
         changed = self._tell_changes()
         self._voxels.replace(self._second)
         total = len(self._submaps.closed) + (open_stretch is not None)
-        return Corrected(self._moved, total - self._moved, self._voxels.block_count, changed)
+        return Corrected(self._moved, total - self._moved, self._voxels.block_count, changed, self._work)
 
     def _tell_changes(self) -> int:
         """Give each block of the second map the version of its last change; returns how many change now.

@@ -1,4 +1,4 @@
-"""What one stretch of the flight adds to the map, cell by cell, and its form at rest: 2 bits per cell.
+"""What one stretch of the flight adds to the map, cell by cell, and its form at rest: 4 bits per cell.
 
 The map's log-odds before and after, with the cells that rays crossed and hit in between, tell
 what the stretch saw. Added up again over all stretches, with the map's clamps, they give the map.
@@ -19,8 +19,9 @@ from companion.mapping.rays import CELLS, WORDS
 from companion.mapping.sensor_model import UNKNOWN, Steps
 
 i16, i64, u8, u64 = np.int16, np.int64, np.uint8, np.uint64
-_PACKED = CELLS // 4  # bytes of a block's codes
-_WEAK, _STRONG, _LISTED = 1, 2, 3  # codes; 0: not seen
+_PACKED = CELLS // 2  # bytes of a block's codes
+_LEVELS = 14  # codes 1 to 14: evidence from the weakest for free to the lower clamp; 0: not seen
+_LISTED = 15  # the value stands in a list
 Levels = NDArray[np.int8]
 
 
@@ -52,9 +53,12 @@ class PackedEvidence:
 
 
 def pack(values: Levels, steps: Steps) -> PackedEvidence:
-    """Compress evidence (N, 512). What lies between the lower clamp and 0 is rounded to two levels."""
+    """Compress evidence (N, 512); without loss if the lower clamp is at most 14 steps down, as by default.
+
+    With other sensor models, what lies between the lower clamp and 0 is rounded to 14 levels.
+    """
     codes, listed = np.empty((len(values), _PACKED), np.uint8), np.empty(values.size, np.int8)
-    count = _pack(values, steps.lowest, codes, listed)
+    count = _pack(values, _codes(steps), codes, listed)
     return PackedEvidence(len(values), _deflate(codes), _deflate(listed[:count]))
 
 
@@ -63,7 +67,7 @@ def unpack(packed: PackedEvidence, steps: Steps) -> Levels:
     codes = np.frombuffer(bytearray(zlib.decompress(packed.codes, -zlib.MAX_WBITS)), np.uint8)
     listed = np.frombuffer(bytearray(zlib.decompress(packed.listed, -zlib.MAX_WBITS)), np.int8)
     values = np.empty((packed.count, CELLS), np.int8)
-    _unpack(codes.reshape(-1, _PACKED), listed, np.array([_weak(steps), steps.lowest], np.int8), values)
+    _unpack(codes.reshape(-1, _PACKED), listed, _levels(steps), values)
     return values
 
 
@@ -75,8 +79,22 @@ def added(levels: Levels, values: Levels, clamps: tuple[int, int]) -> Levels:
     return total
 
 
-def _weak(steps: Steps) -> int:
-    return min(-1, round(steps.lowest / 4))
+def _levels(steps: Steps) -> NDArray[np.int8]:
+    """Value (15,) of each code but the last; that of 0 is UNKNOWN."""
+    count = min(_LEVELS, -steps.lowest)
+    levels = np.rint(np.minimum(np.arange(_LEVELS + 1), count) * (steps.lowest / count)).astype(np.int8)
+    levels[0] = UNKNOWN
+    return levels
+
+
+def _codes(steps: Steps) -> NDArray[np.uint8]:
+    """Code (256,) of each value, indexed by the value as uint8."""
+    levels = _levels(steps).astype(np.int64)
+    codes = np.full(256, _LISTED, np.uint8)
+    for value in range(steps.lowest, 0):
+        codes[value % 256] = 1 + np.argmin(np.abs(levels[1:] - value))
+    codes[UNKNOWN % 256] = 0
+    return codes
 
 
 def _deflate(array: NDArray[np.generic]) -> bytes:
@@ -119,43 +137,34 @@ def _add(levels, values, bounds, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pack(values, lowest, codes, listed):  # type: ignore[no-untyped-def]
+def _pack(values, table, codes, listed):  # type: ignore[no-untyped-def]
     count = 0
     for n in range(values.shape[0]):
         for k in range(_PACKED):
-            byte = 0
-            for j in range(4):
-                value = i64(values[n, 4 * k + j])
-                code = 0
-                if value != UNKNOWN:
-                    code = _LISTED
-                    if lowest <= value < 0:
-                        code = _STRONG if 2 * value <= lowest else _WEAK
-                    else:
-                        listed[count] = value
-                        count += 1
-                byte |= code << (2 * j)
-            codes[n, k] = byte
+            low, high = table[u8(values[n, 2 * k])], table[u8(values[n, 2 * k + 1])]
+            codes[n, k] = low | u8(high << u8(4))
+            if low == u8(_LISTED):
+                listed[count] = values[n, 2 * k]
+                count += 1
+            if high == u8(_LISTED):
+                listed[count] = values[n, 2 * k + 1]
+                count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
 def _unpack(codes, listed, levels, values):  # type: ignore[no-untyped-def]
-    """`levels` = (weak, strong)."""
-    table = np.empty((256, 4), np.int8)
-    for byte in range(256):
-        for j in range(4):
-            code = (byte >> (2 * j)) & 3
-            table[byte, j] = np.int8(UNKNOWN) if code == 0 else levels[min(code, _STRONG) - 1]
-    words = table.view(np.uint32)
-    lines = values.view(np.uint32)
     taken = 0
     for n in range(codes.shape[0]):
         for k in range(_PACKED):
-            byte = codes[n, k]
-            lines[n, k] = words[byte, 0]
-            if byte & (byte >> u8(1)) & u8(0x55):
-                for j in range(4):
-                    if (byte >> u8(2 * j)) & u8(3) == _LISTED:
-                        values[n, 4 * k + j] = listed[taken]
-                        taken += 1
+            low, high = codes[n, k] & u8(15), codes[n, k] >> u8(4)
+            if low == u8(_LISTED):
+                values[n, 2 * k] = listed[taken]
+                taken += 1
+            else:
+                values[n, 2 * k] = levels[low]
+            if high == u8(_LISTED):
+                values[n, 2 * k + 1] = listed[taken]
+                taken += 1
+            else:
+                values[n, 2 * k + 1] = levels[high]

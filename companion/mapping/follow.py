@@ -16,7 +16,7 @@ from companion.mapping.voxel_map import VoxelMap
 class FollowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Whether and how the map follows corrected poses."""
 
-    enabled: bool = True  # costs a seventh of insertion, and 40 MB per km at 0.2 m
+    enabled: bool = True  # costs a seventh of insertion, and 60 MB per km at 0.2 m
     submaps: SubmapConfig = SubmapConfig()
     correction: CorrectionConfig = CorrectionConfig()
 

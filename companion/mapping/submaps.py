@@ -115,7 +115,7 @@ class Submaps:
             self._anchor_ns = stamp_ns
         if self._length_m >= self.config.length_m:
             self.close()
-        self._pack()
+        self.pack_some()
 
     def close(self) -> tuple[Submap, Levels] | None:
         """End the open stretch and begin another; returns it with its evidence, not packed yet."""
@@ -140,7 +140,7 @@ class Submaps:
         more = np.zeros((-(-count // _GROWTH) * _GROWTH - len(self._crossed), WORDS), np.uint64)
         self._crossed, self._hit = np.concatenate([self._crossed, more]), np.concatenate([self._hit, more])
 
-    def _pack(self) -> None:
+    def pack_some(self) -> None:
         """Pack a bounded number of blocks of the oldest stretch that has ended."""
         if not self._closing:
             return
