@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.mapping.block_hash import EMPTY, enter, find, find_or_make, leave, slot_of
-from companion.mapping.fold import fold_bits
+from companion.mapping.fold import MARKS, fold_bits
 from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid
 from companion.mapping.sensor_model import UNKNOWN, Steps
 
@@ -19,7 +19,9 @@ Watch = Callable[[NDArray[np.int64], NDArray[np.int64], tuple[NDArray[np.uint64]
 """Sees a scan right before it changes the store: numbers (K,) of the scratch blocks it met, rows (K,)
 of the store, and the bits `free`, `hit` (N, 8) of all scratch blocks."""
 _GROWTH = 4096  # blocks: 2 MB at a time, so that growing never stalls a scan
-_PER_ROW = ("xyz", "log_odds", "changed_at", "seen_ns", "held", "_settled")
+_PER_ROW = ("xyz", "log_odds", "changed_at", "seen_ns", "held", "marks", "stirred", "_settled")
+
+_NOT_TAKEN = ("marks", "stirred", "_settled")  # what `take` leaves out
 
 
 class BlockStore:
@@ -37,6 +39,8 @@ class BlockStore:
         self.changed_at = np.zeros(_GROWTH, np.int64)  # version in which a cell last changed its class
         self.seen_ns = np.zeros(_GROWTH, np.int64)  # stamp of the newest scan with a ray in the block
         self.held = np.zeros(_GROWTH, np.uint8)  # 1: of a loaded map, which no decay may erase
+        self.marks = np.zeros((_GROWTH, len(MARKS), WORDS), np.uint64)  # see fold.py; evicted blocks lose them
+        self.stirred = np.zeros(_GROWTH, np.uint8)  # passes of decay that have to look at the block
         self._settled = np.zeros((_GROWTH, WORDS), np.uint64)  # bits: the cell is at the lower clamp
         self._keys = np.full(4 * _GROWTH, EMPTY, np.int64)
         self._rows = np.zeros(4 * _GROWTH, np.int32)
@@ -71,7 +75,7 @@ class BlockStore:
         words = (grid.free.reshape(-1, WORDS), grid.hit.reshape(-1, WORDS))
         if watch is not None:
             watch(met, rows, words)
-        fold_bits(met, rows, words, (self.log_odds, self._settled), amounts, changed)
+        fold_bits(met, rows, words, (self.log_odds, self._settled, self.marks, self.stirred), amounts, changed)
         self.seen_ns[rows] = stamp_ns
         return len(met), self.xyz[self.mark_changed(rows[changed != 0])]
 
@@ -110,7 +114,7 @@ class BlockStore:
 
     def take(self, rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Copies of everything that the blocks in `rows` (K,) hold, by the name of its array."""
-        return {name: getattr(self, name)[rows] for name in _PER_ROW if name != "_settled"}
+        return {name: getattr(self, name)[rows] for name in _PER_ROW if name not in _NOT_TAKEN}
 
     def put(self, blocks: Mapping[str, NDArray[Any]], lowest: int) -> None:
         """Take in blocks as `take` gave them, none of them there; nothing of them has changed."""
@@ -119,6 +123,7 @@ class BlockStore:
         for name, array in blocks.items():
             getattr(self, name)[first:last] = array
         self._settled[first:last] = _settled(blocks["log_odds"], lowest)
+        self.marks[first:last] = self.stirred[first:last] = 0
         self.count = last
         enter(self.xyz, np.arange(first, last), self._keys, self._rows)
 
@@ -145,7 +150,7 @@ class BlockStore:
     def _blank(self, first: int, last: int) -> None:
         """Make rows those of unknown blocks; `xyz` is the caller's matter."""
         self.log_odds[first:last] = UNKNOWN
-        for array in (self._settled, self.changed_at, self.seen_ns, self.held):
+        for array in (self._settled, self.changed_at, self.seen_ns, self.held, self.marks, self.stirred):
             array[first:last] = 0
 
     def _reserve(self, count: int) -> None:

@@ -9,6 +9,10 @@ from companion.mapping.rays import CELLS, WORDS
 from companion.mapping.sensor_model import UNKNOWN
 
 i16, u8, u64 = np.int16, np.uint8, np.uint64
+MARKS = CAME, FRESH, MISSED, QUIET, STILL, PROVEN = 0, 1, 2, 3, 4, 5
+"""Bits per cell, for decay: it was at the lower clamp when it was hit; since the last pass hit, and passed
+by rays; occupied without a hit between the last two passes, and the two before; proven to stay."""
+PASSES = 4  # after which a block that no scan stirs holds nothing stale any more
 
 
 @njit(cache=True, nogil=True)
@@ -18,7 +22,7 @@ def fold_bits(met, rows, words, blocks, amounts, changed):  # type: ignore[no-un
     A miss cannot change a settled cell, so most blocks of a place seen before are skipped.
     """
     free, hit = words
-    log_odds, settled = blocks
+    log_odds, settled, all_marks, stirred = blocks
     octets = np.empty((2, CELLS // 8), np.uint64)  # of cells that get a miss, a hit
     for m in range(met.size):
         f, h, row = free[met[m]], hit[met[m]], rows[m]
@@ -28,6 +32,7 @@ def fold_bits(met, rows, words, blocks, amounts, changed):  # type: ignore[no-un
             f[w] &= ~(h[w] | done[w])
             any_bit |= f[w] | h[w]
         if any_bit != u64(0):
+            _mark(f, h, done, all_marks[row], stirred, row)
             _spread(f.view(np.uint8), octets[0])
             _spread(h.view(np.uint8), octets[1])
             cells = log_odds[row]
@@ -35,6 +40,19 @@ def fold_bits(met, rows, words, blocks, amounts, changed):  # type: ignore[no-un
             _settle(cells.view(np.uint64), u8(amounts[2]), done.view(np.uint8))
         f[:] = u64(0)
         h[:] = u64(0)
+
+
+@njit(cache=True, nogil=True)
+def _mark(missed, hit, settled, marks, stirred, row):  # type: ignore[no-untyped-def]
+    """Note for decay what befell which cell."""
+    news = u64(0)
+    for w in range(WORDS):
+        marks[CAME, w] |= hit[w] & settled[w]
+        marks[FRESH, w] |= hit[w]
+        marks[MISSED, w] |= missed[w]
+        news |= hit[w] | (missed[w] & marks[QUIET, w])
+    if news != u64(0):
+        stirred[row] = PASSES
 
 
 @njit(cache=True, nogil=True)

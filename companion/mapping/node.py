@@ -13,6 +13,7 @@ from companion.core.node import Node, Outputs, on
 from companion.core.rig import Rig
 from companion.core.topics import CORRECTIONS, LOCAL_MAP, MAP_DELTA, MAP_FULL, MAP_STATUS, OCCUPIED, REGISTERED, WHY
 from companion.mapping.correction import warm_correction
+from companion.mapping.decay import Decay, DecayConfig, decay
 from companion.mapping.distance_field import DistanceField, FieldConfig
 from companion.mapping.follow import FollowConfig, MapFollower
 from companion.mapping.free_volume import cells_around
@@ -28,6 +29,7 @@ class MappingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     voxels: VoxelMapConfig = VoxelMapConfig()
     field: FieldConfig = FieldConfig()
+    decay: DecayConfig = DecayConfig()
     follow: FollowConfig = FollowConfig()
     share: ShareConfig = ShareConfig()
     landmarks: LandmarkConfig = LandmarkConfig()  # of LandmarkNode
@@ -56,6 +58,7 @@ class MappingNode(Node):
         self.scans = self.skipped_pose = self.skipped_stamp = 0
         self._field = DistanceField(config.field, resolution_m=config.voxels.resolution_m)
         self.follower = MapFollower(config.follow, self.voxels)
+        self._decay = Decay(config.decay)
         self._share = MapShare(config.share)
         self._newest_ns = -1
         self._compile()
@@ -82,6 +85,7 @@ class MappingNode(Node):
             stamp_ns=scan.stamp_ns,
             watch=self.follower.watch,
         )
+        self._decay.after_scan(self.voxels, scan.stamp_ns)
         yield from self._follow(scan)
         if self.scans % self.config.map_every == 0:
             yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
@@ -112,6 +116,7 @@ class MappingNode(Node):
         """Run every kernel once on nothing, so that the first scan does not wait for compilers."""
         zero = np.zeros(3)
         self.voxels.insert(np.empty((0, 3), np.float32), R_odom_body=np.eye(3), p_odom=zero, origin_odom=zero)
+        decay(self.voxels, 0, self.config.decay, since_ns=0)
         self._field.around(self.voxels, zero, 0)
         warm_share(self.voxels)
         warm_correction(self.config.voxels)
