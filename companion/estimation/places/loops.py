@@ -117,6 +117,10 @@ class LoopFinder:
         since = self._flown_m - (self._way[self._submaps[-1].keyframe] if self._submaps else 0.0)
         return self._close() if since >= config.submap_m else 0
 
+    def poses(self) -> Array:
+        """Poses (K, 7) of the keyframes as corrected last, continued by odometry."""
+        return np.array(self._poses)
+
     def corrected(self) -> Array:
         """The most likely poses (K, 7) of the keyframes, x y z qw qx qy qz in odom, under which the newest stays."""
         done = optimise(self._graph(), self.config.optimise).graph.poses

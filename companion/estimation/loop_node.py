@@ -1,0 +1,88 @@
+"""Loop node: registered scans in, corrected poses of the past out when a place is seen again."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.geometry import rotation_from_quaternion
+from companion.core.messages import LioState, PoseCorrections, RegisteredScan, Why
+from companion.core.node import Node, Outputs, on
+from companion.core.topics import CORRECTIONS, LIO_STATE, REGISTERED, WHY
+from companion.estimation.downsample import Thinner
+from companion.estimation.places.loops import LoopConfig, LoopFinder
+from companion.estimation.places.verify import align
+
+
+class LoopNodeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Loops in flight."""
+
+    enabled: bool = True
+    loops: LoopConfig = LoopConfig()
+    least_shift_m: Annotated[float, msgspec.Meta(ge=0)] = 0.15  # smaller corrections are not worth a new map
+
+
+class LoopNode(Node):
+    """Publishes only what moves the past; odometry, and what flies on it, is never touched."""
+
+    publishes = (CORRECTIONS, WHY)
+
+    def __init__(self, config: LoopNodeConfig) -> None:
+        self.config = config
+        self.finder = LoopFinder(config.loops)
+        if config.enabled:
+            self._compile()
+
+    @on(LIO_STATE)
+    def begin(self, state: LioState) -> None:
+        """A start of odometry is a new frame: what was seen before hangs on nothing."""
+        if state.source == "start":
+            self.finder = LoopFinder(self.config.loops)
+
+    @on(REGISTERED)
+    def scan(self, scan: RegisteredScan) -> Outputs:
+        """Remember it; say so when it closes a loop that moves anything."""
+        if not self.config.enabled or not _usable(scan, self.finder):
+            return
+        R = rotation_from_quaternion(scan.q_odom_body)
+        found = self.finder.add(scan.stamp_ns, scan.points_body, R, scan.p_odom)
+        if not found:
+            return
+        before = self.finder.poses()
+        poses = self.finder.corrected()
+        shift_m = float(np.linalg.norm(poses[:, :3] - before[:, :3], axis=1).max())
+        if shift_m < self.config.least_shift_m:
+            return
+        closure = self.finder.closures[-1]
+        yield WHY(
+            Why(
+                stamp_ns=scan.stamp_ns,
+                node="LoopNode",
+                what=f"place of keyframe {closure.earlier} seen again: the past moves by up to {shift_m:.2f} m",
+                because=f"{closure.trunks} trunks agree and {closure.near:.0%} of the points fit",
+            )
+        )
+        yield CORRECTIONS(
+            PoseCorrections(
+                stamp_ns=scan.stamp_ns,
+                stamps_ns=np.array(self.finder.stamps_ns, np.int64),
+                p_odom=poses[:, :3].copy(),
+                q_odom_body=poses[:, 3:].copy(),
+            )
+        )
+
+    def _compile(self) -> None:
+        """Compare a corner of a room with itself, so that no closure in flight waits for compilers."""
+        grid = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), axis=-1).reshape(-1, 2) / 4.0
+        walls = [np.insert(grid, axis, 0.0, axis=1) for axis in range(3)]
+        corner = Thinner().firsts(np.concatenate(walls).astype(np.float32), self.config.loops.thin_m)
+        align(corner, corner, (np.eye(3), np.zeros(3)), self.config.loops.verify)
+
+
+def _usable(scan: RegisteredScan, finder: LoopFinder) -> bool:
+    """Finite, a unit quaternion, newer than the last keyframe."""
+    numbers = np.concatenate([scan.p_odom, scan.q_odom_body])
+    newer = not finder.stamps_ns or scan.stamp_ns > finder.stamps_ns[-1]
+    return newer and bool(np.isfinite(numbers).all()) and abs(float(scan.q_odom_body @ scan.q_odom_body) - 1.0) < 1e-3
