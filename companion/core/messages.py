@@ -221,7 +221,7 @@ class MapDelta:
     version_to: int
     resolution_m: float
     block_count: int
-    data: bytes  # zlib of one record of 140 bytes per block, as in MapDelta.msg
+    data: bytes  # LZ4 frame of one record of 140 bytes per block, as in MapDelta.msg
 
 
 # --- mission ------------------------------------------------------------------------

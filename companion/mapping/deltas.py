@@ -1,13 +1,12 @@
 """The map as bytes for others: blocks that changed since a version, or all, with 2 bits per voxel.
 
-A record per block, all of them in one zlib stream: `MapDelta.msg` has the layout. A delta holds
+A record per block, all of them in one LZ4 frame: `MapDelta.msg` has the layout. A delta holds
 states, not differences, so applying one twice, or one that begins too early, does no harm.
 """
 
 from __future__ import annotations
 
-import zlib
-
+import lz4.frame
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from companion.mapping.rays import CELLS
 from companion.mapping.voxel_map import VoxelMap
 
 RECORD = np.dtype([("xyz", "<i4", 3), ("states", "u1", CELLS // 4)])
-_FASTEST = 1  # 1 us and 31 bytes per block of a forest; level 6 takes 4.7 us for 27 bytes
+_FRAME = {"content_checksum": True, "store_size": False}  # 0.2 us, 36 bytes per block; zlib's 31 bytes take 1 us
 _MOST_BLOCKS = 1 << 22  # 0.6 GB of records: no message is larger
 _HALF_RANGE = 1 << 20  # of block numbers, as in the hash
 u16, u64 = np.uint16, np.uint64
@@ -43,7 +42,7 @@ def states_of(records: Records) -> NDArray[np.uint8]:
 
 
 def in_order(block_xyz: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Sorted by x, then y, then z: the same blocks give the same bytes whatever the store's order is."""
+    """Sorted by x, then y, then z."""
     ordered: NDArray[np.int32] = block_xyz[np.argsort(keys_of(block_xyz))]
     return ordered
 
@@ -67,7 +66,7 @@ def delta_since(voxels: VoxelMap, version: int, *, stamp_ns: int, map_ns: int) -
         version_to=voxels.version,
         resolution_m=voxels.resolution_m,
         block_count=len(changed),
-        data=zlib.compress(records_of(voxels, changed).tobytes(), _FASTEST),
+        data=lz4.frame.compress(records_of(voxels, changed).tobytes(), **_FRAME),
     )
 
 
@@ -85,8 +84,8 @@ class FullWalk:
         self._map_ns = map_ns
         self._begun = voxels.version
         self._left = in_region_order(voxels.changed_since(-1))  # so that each cold region is unpacked once or twice
-        self._stream = zlib.compressobj(_FASTEST)
-        self._parts: list[bytes] = []
+        self._stream = lz4.frame.LZ4FrameCompressor(content_checksum=True)
+        self._parts: list[bytes] = [self._stream.begin()]
         self._count = 0
 
     def advance(self, voxels: VoxelMap, *, blocks: int, stamp_ns: int) -> MapDelta | None:
@@ -118,11 +117,11 @@ def unpack(delta: MapDelta) -> Records:
     if not 0 <= count <= _MOST_BLOCKS:
         raise InputError(f"{count} blocks", field="block_count", valid=f"0 to {_MOST_BLOCKS}")
     wanted = count * RECORD.itemsize
-    stream = zlib.decompressobj()
+    stream = lz4.frame.LZ4FrameDecompressor()
     try:
         data = stream.decompress(delta.data, wanted + 1)
-    except zlib.error as error:
-        raise InputError(f"no zlib stream: {error}", field="data") from None
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"no LZ4 frame: {error}", field="data") from None
     if len(data) != wanted or not stream.eof:
         raise InputError(f"not the {wanted} bytes of {count} blocks", field="data")
     records = np.frombuffer(data, RECORD)

@@ -29,7 +29,7 @@ class Frontiers:
     >>> frontiers.update(voxels)
     >>> frontiers.centers(voxels.resolution_m)  # (N, 3), m
 
-    Neighbours are those across a face. What was evicted counts as it was when it was looked at.
+    Neighbours are those across a face. What changed, or is beside, comes back from cold memory.
     """
 
     def __init__(self) -> None:
@@ -43,6 +43,8 @@ class Frontiers:
         near = (changed[:, None] + _NEIGHBOURS).reshape(-1, 3).astype(np.int32)
         _, first = np.unique(keys_of(near), return_index=True)
         near = near[first]
+        if len(near):
+            voxels.memory.bring_back((near.min(axis=0) - np.int64(1), near.max(axis=0) + np.int64(2)))
         bits = np.empty((len(near), WORDS), np.uint64)
         _frontier_bits(near, voxels.blocks.table, voxels.blocks.log_odds, bits)
         raw = bits.tobytes()

@@ -77,9 +77,18 @@ def raycast(
     ranges_m, states = np.full(len(origins), np.nan), np.full(len(origins), UNKNOWN_CELL, np.uint8)
     origins[~good] = directions[~good] = np.nan
     rays, limits = (origins / voxels.resolution_m, directions), (max_range_m / voxels.resolution_m, unknown == "stop")
+    ends = rays[0] + rays[1] * limits[0]
+    bring_back(voxels, np.concatenate([rays[0][good], ends[good]]), 1.0)
     _raycast(voxels.blocks.table, voxels.blocks.log_odds, rays, limits, (ranges_m, states))
     ranges_m *= voxels.resolution_m
     return RayHits(states == OCCUPIED_CELL, origins + directions * ranges_m[:, None], ranges_m, states)
+
+
+def bring_back(voxels: VoxelMap, cells: Array, margin: float) -> None:
+    """Have all blocks in the store that meet the box around `cells` (N, 3) and `margin`, cells, beyond it."""
+    if len(cells):
+        low, high = cells.min(axis=0) - margin, cells.max(axis=0) + margin
+        voxels.memory.bring_back((np.floor(low / BLOCK).astype(np.int64), np.floor(high / BLOCK).astype(np.int64) + 1))
 
 
 @njit(cache=True, nogil=True)

@@ -24,7 +24,8 @@ class ShareConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """How often the map goes to others, in scans (10 a second); 0: never. Nothing goes that did not change."""
 
     occupied_every: _Scans = 5  # scans per cloud of occupied voxels, for viewers
-    occupied_radius_m: Annotated[float, msgspec.Meta(gt=0.0)] = 50.0  # around the vehicle: bounds the cloud
+    occupied_radius_m: Annotated[float, msgspec.Meta(gt=0.0)] = 50.0
+    """Around the vehicle; blocks that memory has put away are left out all the same."""
     delta_every: _Scans = 5  # scans per delta
     full_every: _Scans = 50  # scans from one whole map to the next, at least
     full_blocks_per_scan: Annotated[int, msgspec.Meta(ge=1)] = 250  # packed per scan: bounds the work of a whole map
@@ -86,7 +87,7 @@ def warm_share(voxels: VoxelMap) -> None:
 def occupied_near(voxels: VoxelMap, p_odom: Array, radius_m: float) -> tuple[Array32, Array32]:
     """Centres (N, 3), m, and log-odds (N,) of the occupied voxels of blocks nearer than `radius_m` to `p_odom` (3,).
 
-    In the order of the store; a block is as near as its centre.
+    In the order of the store, and without what lies in cold memory; a block is as near as its centre.
     """
     blocks = voxels.blocks
     center = p_odom / (BLOCK * voxels.resolution_m) - 0.5
@@ -95,10 +96,10 @@ def occupied_near(voxels: VoxelMap, p_odom: Array, radius_m: float) -> tuple[Arr
     rows = np.flatnonzero(np.einsum("ij,ij->i", gap, gap) < reach * reach)
     words = blocks.log_odds.view(np.uint64)
     found = int(_count_occupied(words, rows))
-    points, log_odds = np.empty((found, 3), np.float32), np.empty(found, np.float32)
+    points, log_odds = np.empty((found + 1, 3), np.float32), np.empty(found + 1, np.float32)
     scales = np.array([voxels.resolution_m, 1.0 / voxels.steps.per_unit])
     _list_occupied(words, (rows, blocks.xyz), scales, points, log_odds)
-    return points, log_odds
+    return points[:found], log_odds[:found]
 
 
 @njit(cache=True, nogil=True)
@@ -114,20 +115,20 @@ def _count_occupied(words, rows):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _list_occupied(words, where, scales, points, log_odds):  # type: ignore[no-untyped-def]
+    """Every cell of a word is written, and written over by the next if it is not occupied: no branch to guess."""
     rows, xyz = where
     cell_m, per_step = scales[0], scales[1]
     found = 0
     for n in range(rows.size):
         row = rows[n]
+        x0, y0, z0 = BLOCK * xyz[row, 0] + 0.5, BLOCK * xyz[row, 1] + 0.5, BLOCK * xyz[row, 2] + 0.5
         for w in range(words.shape[1]):
             word = words[row, w]
             if word & u64(_SIGNS) == u64(_SIGNS):
                 continue
+            x, y = np.float32((x0 + (w >> 3)) * cell_m), np.float32((y0 + (w & 7)) * cell_m)
             for k in range(BLOCK):
                 level = (word >> u64(8 * k)) & u64(0xFF)
-                if level < u64(0x80):
-                    points[found, 0] = (BLOCK * xyz[row, 0] + (w >> 3) + 0.5) * cell_m
-                    points[found, 1] = (BLOCK * xyz[row, 1] + (w & 7) + 0.5) * cell_m
-                    points[found, 2] = (BLOCK * xyz[row, 2] + k + 0.5) * cell_m
-                    log_odds[found] = level * per_step
-                    found += 1
+                points[found, 0], points[found, 1], points[found, 2] = x, y, (z0 + k) * cell_m
+                log_odds[found] = level * per_step
+                found += level < u64(0x80)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from companion.core.errors import InputError
 from companion.core.messages import Array
 from companion.mapping.block_hash import EMPTY, slot_of
+from companion.mapping.queries import bring_back
 from companion.mapping.rays import BLOCK
 from companion.mapping.sensor_model import UNKNOWN
 from companion.mapping.voxel_map import VoxelMap
@@ -36,6 +37,7 @@ def known_free(voxels: VoxelMap, a_odom: Array, b_odom: Array, radius_m: float) 
     free = np.zeros(len(a), np.bool_)
     a, b = a[good] / voxels.resolution_m, b[good] / voxels.resolution_m
     swept = np.empty(len(a), np.bool_)
+    bring_back(voxels, np.concatenate([a, b]), radius_m / voxels.resolution_m + 1.0)
     _known_free(voxels.blocks.table, voxels.blocks.log_odds, (a, b - a), radius_m / voxels.resolution_m, swept)
     free[good] = swept
     return free

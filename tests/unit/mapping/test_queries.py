@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.errors import InputError
+from companion.mapping.memory import MemoryConfig
 from companion.mapping.queries import box, raycast
 from companion.mapping.swept import known_free
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
@@ -237,3 +238,32 @@ def test_segments_that_are_none_are_not_free():
             known_free(voxels, a, b, radius_m)
     with pytest.raises(InputError, match="b_odom"):
         known_free(voxels, a, b[:2], 0.3)
+
+
+# --- what is compressed
+
+
+def test_cold_blocks_answer_as_warm_ones():
+    rng = np.random.default_rng(6)
+    maps = [
+        VoxelMap(VoxelMapConfig(max_range_m=3.0, miss_clear_range_m=3.0, memory=MemoryConfig(keep_m=keep_m)))
+        for keep_m in (0.0, 1000.0)
+    ]
+    for _ in range(60):
+        origin = rng.uniform(-12, 12, 3) * [1, 1, 0.1]
+        points = rng.normal(size=(40, 3)).astype(np.float32)
+        for voxels in maps:
+            voxels.insert(points, R_odom_body=np.eye(3), p_odom=origin, origin_odom=origin)
+    origins, directions = rng.uniform(-12, 12, (200, 3)) * [1, 1, 0.1], rng.normal(size=(200, 3))
+    a, b = origins, origins + 0.2 * directions
+    for part in range(4):  # each finds cold what the last one did not bring back
+        some = slice(part, None, 4)
+        assert maps[0].memory.cold_blocks > 0 and maps[1].memory.cold_blocks == 0
+        one, other = (raycast(v, origins[some], directions[some], 9.0, unknown="pass") for v in maps)
+        assert all(np.array_equal(x, y) for x, y in zip(one, other, strict=True))
+        assert np.array_equal(*(known_free(v, a[some], b[some], 0.05) for v in maps))
+        for voxels in maps:
+            voxels.insert(points, R_odom_body=np.eye(3), p_odom=origins[part], origin_odom=origins[part])
+            for _ in range(30):  # what was asked for may go again
+                voxels.memory.bring_back((np.zeros(3, np.int64), np.zeros(3, np.int64)))
+                voxels.insert(points[:0], R_odom_body=np.eye(3), p_odom=origins[part], origin_odom=origins[part])
