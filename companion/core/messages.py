@@ -200,6 +200,9 @@ class MapStatus:
     stamp_ns: int  # of the newest scan inside the newest local map
     scans: int  # taken in so far
     blocks: int  # of 8 x 8 x 8 voxels, alive
+    cold_blocks: int  # of them, compressed because they are far
+    forgotten_blocks: int  # dropped since the map began, because it did not fit the budget
+    memory_bytes: int  # of the map
 
 
 @message

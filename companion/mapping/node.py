@@ -89,7 +89,7 @@ class MappingNode(Node):
         yield from self._follow(scan)
         if self.scans % self.config.map_every == 0:
             yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
-            yield MAP_STATUS(MapStatus(stamp_ns=scan.stamp_ns, scans=self.scans + 1, blocks=self.voxels.block_count))
+            yield MAP_STATUS(self._status(scan.stamp_ns))
         self.scans += 1
         yield from self._share.after_scan(self.voxels, scan.p_odom, stamp_ns=scan.stamp_ns)
 
@@ -103,6 +103,17 @@ class MappingNode(Node):
         if done:
             what = f"corrected the map: {done.moved} of {done.moved + done.stayed} stretches of the flight moved"
             yield WHY(Why(stamp_ns=scan.stamp_ns, node="mapping", what=what, because="past poses were corrected"))
+
+    def _status(self, stamp_ns: int) -> MapStatus:
+        voxels = self.voxels
+        return MapStatus(
+            stamp_ns=stamp_ns,
+            scans=self.scans + 1,
+            blocks=voxels.block_count,
+            cold_blocks=voxels.memory.cold_blocks,
+            forgotten_blocks=voxels.memory.forgotten_blocks,
+            memory_bytes=voxels.memory_bytes,
+        )
 
     def _filled_by_vehicle(self, p_odom: Array) -> Array:
         """Centres (K, 3) of the cells that are free because the vehicle is, or starts, there."""

@@ -266,7 +266,7 @@ def test_a_station_is_cut_off_when_its_certificate_expires(inside, ground, certs
     soon = datetime.now(UTC) + timedelta(seconds=3) - timedelta(days=1)
     make_certificate(certs[0], "brief", now=soon, days=1, force=True)
     outlet, box = BusOutlet(inside[0], {"Source": [topics.MAP_STATUS]}, vehicle="v"), Box()
-    status = m.MapStatus(stamp_ns=1, scans=1, blocks=1)
+    status = m.MapStatus(stamp_ns=1, scans=1, blocks=1, cold_blocks=0, forgotten_blocks=0, memory_bytes=1)
     credentials = find_credentials(certs[0] / "brief")
     with open_session("client", endpoint=ground, credentials=credentials) as opened, Graph(opened) as graph:
         Hearing(graph, [topics.MAP_STATUS], box, listener="brief", vehicle="v")

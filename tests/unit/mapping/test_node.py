@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from companion.core.rig import Rig
 from companion.core.topics import LOCAL_MAP, MAP_STATUS, REGISTERED
 from companion.mapping.distance_field import FieldConfig
 from companion.mapping.free_volume import cells_around
+from companion.mapping.memory import MemoryConfig
 from companion.mapping.node import MappingConfig, MappingNode
 from companion.mapping.voxel_map import VoxelMapConfig
 
@@ -150,3 +152,23 @@ def test_cells_around_are_those_whose_centre_is_inside():
     inside |= np.all(np.abs(d) <= 0.1, axis=1)
     assert sorted(map(tuple, np.round(cells, 6).tolist())) == sorted(map(tuple, np.round(every[inside], 6).tolist()))
     assert len(cells_around(p, radius_m=0.01, height_m=0.0, cell_m=0.2)) == 1
+
+
+def test_the_status_tells_what_is_compressed_and_what_the_budget_cost():
+    """A walk of 80 m with 16 regions moved per scan; the second map may hold hardly more than is in reach."""
+    told = []
+    for budget_mb in (1000.0, 0.1):
+        memory = MemoryConfig(keep_m=0.0, budget_mb=budget_mb)
+        voxels = VoxelMapConfig(max_range_m=5.0, miss_clear_range_m=5.0, memory=memory)
+        node = MappingNode(msgspec.structs.replace(NEARBY, voxels=voxels, map_every=1), Rig(), hull_radius_m=0.35)
+        for k in range(40):
+            outputs = list(node.handle(REGISTERED, scan(k + 1, p=(2.0 * k, 0.0, 0.3))))
+        (status,) = [o.message for o in outputs if o.topic is MAP_STATUS]
+        assert status.blocks == node.voxels.block_count == node.voxels.blocks.count + status.cold_blocks
+        assert status.memory_bytes == node.voxels.memory_bytes
+        told.append(status)
+    roomy, tight = told
+    assert roomy.cold_blocks > 0
+    assert roomy.forgotten_blocks == 0
+    assert tight.cold_blocks == 0
+    assert tight.blocks + tight.forgotten_blocks == roomy.blocks

@@ -117,7 +117,12 @@ class Guarded:
                 inlier_fraction=0.9, weakest_direction=0.3,
             )))  # fmt: skip
         if "map" in self.on:
-            sent.append((topics.MAP_STATUS, m.MapStatus(stamp_ns=now, scans=1, blocks=1)))
+            sent.append(
+                (
+                    topics.MAP_STATUS,
+                    m.MapStatus(stamp_ns=now, scans=1, blocks=1, cold_blocks=0, forgotten_blocks=0, memory_bytes=1),
+                )
+            )
         sent.append((topics.VEHICLE, m.VehicleStatus(
             stamp_ns=now, connected=True, armed=self.armed, mode="OFFBOARD", landed=self.landed, ready=True,
             battery_fraction=0.9, p_odom=zero, v_odom=zero, text="",
