@@ -29,9 +29,9 @@ class LandmarkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """What is seen as a landmark, how often, and what is kept of it."""
 
     enabled: bool = True
-    image_rate_hz: _Hertz = 2.0  # images looked at, at most
+    image_rate_hz: _Hertz = 1.5  # images looked at, at most
     trunk_rate_hz: _Hertz = 0.4  # local maps looked at, at most
-    publish_every: Annotated[int, msgspec.Meta(ge=1)] = 10  # images looked at per message
+    publish_every: Annotated[int, msgspec.Meta(ge=1)] = 8  # images looked at per message
     keypoints: KeypointConfig = KeypointConfig()
     back_projection: BackProjectionConfig = BackProjectionConfig()
     trunks: TrunkConfig = TrunkConfig()
