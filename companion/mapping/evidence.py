@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from companion.mapping.rays import CELLS, WORDS
 from companion.mapping.sensor_model import UNKNOWN, Steps
 
-i16, i64, u8, u64 = np.int16, np.int64, np.uint8, np.uint64
+i16, u8, u64 = np.int16, np.uint8, np.uint64
 _PACKED = CELLS // 2  # bytes of a block's codes
 _LEVELS = 14  # codes 1 to 14: evidence from the weakest for free to the lower clamp; 0: not seen
 _LISTED = 15  # the value stands in a list

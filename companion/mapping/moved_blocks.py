@@ -139,10 +139,24 @@ def _lost(xyz, values, motion, found):  # type: ignore[no-untyped-def]
                 i = math.floor(R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + t[0])
                 j = math.floor(R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + t[1])
                 k = math.floor(R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + t[2])
-                old_x, old_y, old_z = _came_from(i, j, k >> 3, motion)
-                if old_x == x and old_y == y and old_z + (k & 7) == BLOCK * xyz[n, 2] + z:
+                if _taken((x, y, BLOCK * xyz[n, 2] + z), (i, j, k), motion):
                     continue
                 found[count, 0], found[count, 1], found[count, 2] = i >> 3, j >> 3, k >> 3
                 found[count, 3], found[count, 4] = ((i & 7) << 6) | ((j & 7) << 3) | (k & 7), value
                 count += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def _taken(old, new, motion):  # type: ignore[no-untyped-def]
+    """Whether cell `new` or one of its neighbours takes what cell `old` holds."""
+    for n in range(27):
+        i, j, k = new[0] + (n // 3) % 3 - 1, new[1] + n % 3 - 1, new[2] + n // 9 - 1
+        if n == 0:  # most often
+            i, j, k = new
+        elif n == 13:
+            i, j, k = new[0] - 1, new[1] - 1, new[2] - 1
+        x, y, z = _came_from(i, j, k >> 3, motion)
+        if x == old[0] and y == old[1] and z + (k & 7) == old[2]:
+            return True
+    return False
