@@ -5,14 +5,18 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from companion.core.messages import PoseCorrections
+from companion.core.messages import PoseCorrections, RegisteredScan
+from companion.core.rig import Rig
+from companion.core.topics import CORRECTIONS, REGISTERED, WHY
 from companion.mapping.correction import Correction, CorrectionConfig
+from companion.mapping.distance_field import FieldConfig
 from companion.mapping.follow import FollowConfig, MapFollower
 from companion.mapping.memory import MemoryConfig
+from companion.mapping.node import MappingConfig, MappingNode
 from companion.mapping.pose_track import PoseCorrector
 from companion.mapping.submaps import SubmapConfig, Submaps
 from companion.mapping.voxel_map import VoxelMap
-from tests.unit.mapping.corridor import CONFIG, STEP_NS, TRUE, anchored, drifted, fly, quaternions
+from tests.unit.mapping.corridor import CONFIG, STEP_NS, TRUE, anchored, drifted, fly, quaternions, scan
 
 DEFAULT = CorrectionConfig()
 SHORT = SubmapConfig(length_m=5.0)
@@ -297,3 +301,30 @@ def test_small_corrections_are_no_work():
     follower.take(message(nudged, KEYS[KEYS < 60]))
     assert follower.after_scan(60 * STEP_NS, DRIFTED[0][60], quaternions(DRIFTED[1])[60]) is None
     assert not follower.busy
+
+
+def test_the_node_follows_and_says_so():
+    config = MappingConfig(
+        voxels=CONFIG,
+        field=FieldConfig(size_m=(8.0, 8.0, 6.0)),
+        follow=FollowConfig(submaps=SHORT, correction=CorrectionConfig(blocks_per_scan=4000)),
+    )
+    node, quaternion = MappingNode(config, Rig(), hull_radius_m=0.35), quaternions(DRIFTED[1])
+    keys, said = KEYS[KEYS < 40], []
+    for k in range(60):
+        returns, misses = scan(k)
+        registered = RegisteredScan(
+            stamp_ns=k * STEP_NS,
+            points_body=returns,
+            miss_dirs_body=misses,
+            origin_body=np.zeros(3),
+            p_odom=DRIFTED[0][k],
+            q_odom_body=quaternion[k],
+        )
+        if k == 40:
+            assert list(node.handle(CORRECTIONS, message(keys=keys))) == []
+        said += [(k, o.message.what) for o in node.handle(REGISTERED, registered) if o.topic is WHY]
+    assert len(said) == 1
+    assert said[0][0] > 41
+    assert said[0][1].startswith("corrected the map: ")
+    assert not node.follower.busy
