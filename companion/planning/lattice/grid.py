@@ -52,6 +52,7 @@ class Scratch:
     def __init__(self, cells: int) -> None:
         self.label = np.zeros(cells, np.uint8)
         self.cost = np.empty(cells)
+        self.given = np.empty(cells, np.uint32)
         self.parent = np.empty(cells, np.int32)
 
 
@@ -81,7 +82,7 @@ class Lattice:
         self._blocked = padded.ravel()
         moves = moves_of(neighbours, corners)
         self._flat = (moves.offsets @ self._strides).astype(np.int64)
-        self._moves = (self._flat, moves.offsets, moves.lengths, moves.needs)
+        self._moves = (self._flat, moves.offsets, moves.lengths, moves.needs, moves.natural)
         fits = scratch is not None and len(scratch.label) == padded.size
         self.scratch = scratch if scratch is not None and fits else Scratch(padded.size)
 
@@ -104,9 +105,9 @@ class Lattice:
         ends = self._ends(start, goal)
         if ends is None:
             return self._nothing(start)
-        label = self.scratch.label
+        label, scratch = self.scratch.label, (self.scratch.label, self.scratch.cost, self.scratch.given)
         world = (self._blocked, self._shape, self._moves, ends, (code, weight, not weighted))
-        cost, expanded, seen = search(*world, label, self.scratch.cost)
+        cost, expanded, seen = search(*world, scratch)
         closed = seen[(label[seen] & CLOSED) > 0]
         if not label[ends[1]]:
             ends, cost = (ends[0], self._nearest(closed, ends[1])), math.inf

@@ -31,6 +31,7 @@ class Moves:
     offsets: NDArray[np.int32]  # (M, 3)
     lengths: Array  # (M,), cells
     needs: NDArray[np.uint32]  # (M,) bit sets of cells that must be free
+    natural: NDArray[np.uint32]  # (M + 1,) bit sets of moves that may follow each; the last: after none, at the start
 
 
 def moves_of(neighbours: int, corners: str) -> Moves:
@@ -46,7 +47,32 @@ def moves_of(neighbours: int, corners: str) -> Moves:
         offsets=np.array(moves, np.int32),
         lengths=np.array([math.sqrt(sum(map(abs, m))) for m in moves]),
         needs=np.array([_need(m) if corners == "keep" else _bit(m) for m in moves], np.uint32),
+        natural=np.array([*_natural(moves, neighbours), 2 ** len(moves) - 1], np.uint32),
     )
+
+
+def _natural(moves: list[tuple[int, int, int]], neighbours: int) -> list[int]:
+    """Moves that need to follow a move in open space, for of all equally long ways one order is enough.
+
+    The order is: diagonals before straight moves (8 and 26), or along x before y before z (4 and 6). Any other
+    follower has an equally long or shorter way around, through the cells next to the one between. After Harabor and
+    Grastien 2011, and Sturtevant and Rabin 2016. With 18 neighbours several orders are equally long: all may follow.
+    """
+    if neighbours == 18:
+        return [2 ** len(moves) - 1] * len(moves)
+    follows = _follows_diagonal if neighbours in (8, 26) else _follows_straight
+    return [sum(1 << n for n, after in enumerate(moves) if follows(before, after)) for before in moves]
+
+
+def _follows_diagonal(before: tuple[int, int, int], after: tuple[int, int, int]) -> bool:
+    """Every axis that moves goes on as before."""
+    return all(a in (0, b) for a, b in zip(after, before, strict=True))
+
+
+def _follows_straight(before: tuple[int, int, int], after: tuple[int, int, int]) -> bool:
+    """On along the same axis, or to a later one."""
+    axis, next_axis = (int(np.flatnonzero(move)[0]) for move in (before, after))
+    return after == before or next_axis > axis
 
 
 def _need(move: tuple[int, ...]) -> int:

@@ -118,6 +118,19 @@ def test_a_better_informed_heuristic_expands_no_more():
     assert counts == sorted(counts, reverse=True) and counts[-1] < 0.5 * counts[0]
 
 
+@pytest.mark.parametrize("neighbours", [4, 8, 6, 26])
+def test_open_space_needs_few_of_the_moves_and_the_cost_stays_the_least(neighbours):
+    """Every cell of an open grid has exactly one way in the order of `natural`: the distance of the metric."""
+    shape = (9, 8, 1) if neighbours in (4, 8) else (7, 6, 5)
+    lattice = Lattice(np.zeros(shape, bool), neighbours=neighbours)
+    expected = brute_costs(np.zeros(shape, bool), (3, 2, 0), neighbours, "keep")
+    for goal, cost in expected.items():
+        assert lattice.search((3, 2, 0), goal, heuristic="none").cost == pytest.approx(cost, abs=1e-9)
+    moves = moves_of(neighbours, "keep")
+    follow = [int(bits).bit_count() for bits in moves.natural[:-1]]
+    assert sum(follow) / len(follow) < 0.65 * len(moves.offsets) and min(follow) == 1
+
+
 def test_a_weight_bounds_the_loss():
     blocked = np.random.default_rng(5).random((40, 40, 12)) < 0.25
     blocked[1, 1, 1] = blocked[38, 37, 9] = False
