@@ -77,9 +77,9 @@ class Observations:
         radius = np.full(count, np.nan) if radius_m is None else np.asarray(radius_m, np.float64)
         _check(kind, descriptor is not None)
         wanted = {"position_odom": (3,), "covariance": (3, 3), "descriptor": (DESCRIPTOR_BYTES,), "radius_m": ()}
-        for name, part in zip(wanted, (position, spread, bits, radius), strict=True):
-            if part.shape != (count, *wanted[name]):
-                raise InputError(f"shape {part.shape}", field=name, valid=str((count, *wanted[name])))
+        for name, shape in zip(wanted, (position.shape, spread.shape, bits.shape, radius.shape), strict=True):
+            if shape != (count, *wanted[name]):
+                raise InputError(f"shape {shape}", field=name, valid=str((count, *wanted[name])))
         good = are_covariances(spread) & (np.abs(position) < 1e6).all(axis=1)
         return cls(position[good], spread[good], np.full(int(good.sum()), kind, np.uint8), bits[good], radius[good])
 
