@@ -24,9 +24,9 @@ class ShareConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """How often the map goes to others, in scans (10 a second); 0: never. Nothing goes that did not change."""
 
     occupied_every: _Scans = 5  # scans per cloud of occupied voxels, for viewers
-    occupied_radius_m: Annotated[float, msgspec.Meta(gt=0.0)] = 50.0
+    occupied_radius_m: Annotated[float, msgspec.Meta(gt=0.0)] = 30.0
     """Around the vehicle; blocks that memory has put away are left out all the same."""
-    delta_every: _Scans = 5  # scans per delta
+    delta_every: _Scans = 10  # scans per delta
     full_every: _Scans = 50  # scans from one whole map to the next, at least
     full_blocks_per_scan: Annotated[int, msgspec.Meta(ge=1)] = 250  # packed per scan: bounds the work of a whole map
 

@@ -10,7 +10,7 @@ from companion.runtime.wire.errors import WireError
 
 _DEFAULT_DEPTH = 42  # rmw_zenoh's own; it stands for empty in the token
 _MAX_NS = 2**63 - 1
-HISTORY_DEPTH = 256  # samples for who comes late: two minutes of map deltas
+HISTORY_DEPTH = 256  # samples for who comes late: four minutes of map deltas
 
 
 @dataclass(frozen=True, slots=True)
