@@ -50,8 +50,8 @@ def draw_planners(world: World, planners: Sequence[str], file: Path, *, pair: in
         axes.text(0.0, 1.02, f"{found}; {plan.iterations} {unit}", transform=axes.transAxes, fontsize=7.5)
     for axes in list(grid.flat)[len(planners) :]:
         axes.set_visible(False)
-    figure.tight_layout(h_pad=1.6, w_pad=0.4, rect=(0, 0.025, 1, 1))
-    figure.text(0.012, 0.01, _CAPTION.format(title=world.title), fontsize=7.5)
+    figure.tight_layout(h_pad=1.6, w_pad=0.4, rect=(0, 0.02, 1, 1))
+    figure.text(0.012, 0.012, _CAPTION.format(title=world.title), fontsize=7.5)
     figure.savefig(file)
     plt.close(figure)
 

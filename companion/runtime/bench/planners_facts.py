@@ -29,7 +29,7 @@ FACTS = {
         "known maps, few dimensions, a proof that there is no way",
     ),
     "theta_star": Facts(
-        "no, but a few per mille above any-angle optimum",
+        "no, but near the any-angle optimum",
         "at the cell size",
         "A* and a line of sight per move",
         "straight ways on a grid without smoothing",
