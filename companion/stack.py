@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from companion.autopilot.node import AutopilotNode
 from companion.config import Config
 from companion.core.node import Node
-from companion.estimation.node import GraphNode, LioNode, PropagatorNode
+from companion.estimation.node import GraphNode, LioNode, LoopNode, PropagatorNode
 from companion.estimation.warm_up import warm_up
 from companion.mapping.landmark_node import LandmarkNode
 from companion.mapping.node import MappingNode
@@ -19,14 +19,14 @@ from companion.sensors.node import SensorsNode
 from companion.tracking.node import TrackingNode
 
 NODES = (
-    SensorsNode, LioNode, PropagatorNode, GraphNode, MappingNode, LandmarkNode, PlanningNode, TrackingNode,
-    MissionNode, SafetyNode, AutopilotNode,
+    SensorsNode, LioNode, PropagatorNode, GraphNode, LoopNode, MappingNode, LandmarkNode, PlanningNode,
+    TrackingNode, MissionNode, SafetyNode, AutopilotNode,
 )  # fmt: skip
 
 GROUPS: dict[str, tuple[type[Node], ...]] = {
     # One process each when the stack runs live: what control needs at once runs where control runs.
     "perception": (SensorsNode, LioNode),
-    "graph": (GraphNode,),
+    "graph": (GraphNode, LoopNode),
     "world": (MappingNode, LandmarkNode, PlanningNode),  # the local map is too large to leave its process
     "control": (PropagatorNode, TrackingNode, MissionNode, SafetyNode, AutopilotNode),
 }
@@ -46,6 +46,7 @@ def build(
         LioNode: lambda: LioNode(config.estimation, config.rig),
         PropagatorNode: lambda: PropagatorNode(config.estimation),
         GraphNode: lambda: GraphNode(config.estimation, config.rig),
+        LoopNode: lambda: LoopNode(config.estimation.loops),
         MappingNode: lambda: MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m),
         LandmarkNode: lambda: LandmarkNode(config.mapping.landmarks, config.rig),
         PlanningNode: lambda: PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),

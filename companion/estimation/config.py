@@ -9,6 +9,7 @@ import msgspec
 from companion.estimation.camera import CameraConfig
 from companion.estimation.graph import GraphConfig
 from companion.estimation.lio import LioConfig
+from companion.estimation.loop_node import LoopNodeConfig
 from companion.estimation.ordering import OrderConfig
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -24,10 +25,11 @@ class PropagatorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
 
 class EstimationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Front end, camera, order of arrival, propagator and graph."""
+    """Front end, camera, order of arrival, propagator, graph and loops."""
 
     lio: LioConfig = LioConfig()
     camera: CameraConfig = CameraConfig()
     order: OrderConfig = OrderConfig()
     propagator: PropagatorConfig = PropagatorConfig()
     graph: GraphConfig = GraphConfig()
+    loops: LoopNodeConfig = LoopNodeConfig()

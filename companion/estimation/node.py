@@ -1,7 +1,8 @@
-"""The three nodes of estimation: front end, propagator to the present, and graph."""
+"""The nodes of estimation: front end, propagator to the present, graph, and loops."""
 
 from companion.estimation.graph_node import GraphNode
 from companion.estimation.lio_node import LioNode
+from companion.estimation.loop_node import LoopNode
 from companion.estimation.propagator_node import PropagatorNode
 
-__all__ = ["GraphNode", "LioNode", "PropagatorNode"]
+__all__ = ["GraphNode", "LioNode", "LoopNode", "PropagatorNode"]
