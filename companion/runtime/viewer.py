@@ -17,7 +17,6 @@ from companion.core.messages import (
     Array,
     Array32,
     Goal,
-    LocalMap,
     Odometry,
     PlanStatus,
     RegisteredScan,
@@ -37,7 +36,6 @@ _LEVELS = {  # of what an operator must see; every other decision is information
     ("safety", "hold"): _WARN,
     ("safety", "land"): _ERROR,
 }
-_OCCUPIED = 2  # LocalMap.state
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +62,6 @@ TF = ViewTopic("tf", "tf2_msgs/msg/TFMessage", shared=True)
 TF_STATIC = ViewTopic("tf_static", "tf2_msgs/msg/TFMessage", shared=True)
 ODOM = ViewTopic("odom", "nav_msgs/msg/Odometry")
 CLOUD = ViewTopic("cloud", "sensor_msgs/msg/PointCloud2")
-OCCUPIED = ViewTopic("map/occupied", "sensor_msgs/msg/PointCloud2")
 PATH = ViewTopic("path", "nav_msgs/msg/Path")
 PLAN = ViewTopic("plan", "nav_msgs/msg/Path")
 GOAL = ViewTopic("goal", "geometry_msgs/msg/PoseStamped")
@@ -120,13 +117,6 @@ def _registered(scan: RegisteredScan) -> Iterator[View]:
     yield View(CLOUD, _cloud(scan.stamp_ns, "base_link", scan.points_body))
 
 
-def _map(m: LocalMap) -> Iterator[View]:
-    """Centres of the occupied cells."""
-    cells = np.argwhere(m.state == _OCCUPIED)
-    points = (m.origin_odom + (cells + 0.5) * m.resolution_m).astype(np.float32)
-    yield View(OCCUPIED, _cloud(m.stamp_ns, "odom", points))
-
-
 def _trajectory(t: Trajectory) -> Iterator[View]:
     yield _path(PATH, t.stamp_ns, t.p_odom)
 
@@ -151,7 +141,6 @@ _VIEWS: dict[str, tuple[Callable[[Any], Iterator[View]], tuple[ViewTopic, ...]]]
     topics.ODOMETRY.name: (_odometry, (TF, ODOM)),
     topics.SMOOTHED.name: (_smoothed, (TF,)),
     topics.REGISTERED.name: (_registered, (CLOUD,)),
-    topics.LOCAL_MAP.name: (_map, (OCCUPIED,)),
     topics.TRAJECTORY.name: (_trajectory, (PATH,)),
     topics.PLAN.name: (_plan, (PLAN,)),
     topics.GOAL.name: (_goal, (GOAL,)),

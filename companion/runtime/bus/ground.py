@@ -40,7 +40,6 @@ RATES_HZ = {  # most per second on the ground link; other topics pass whole
     "truth": 10.0,
     "odom": 10.0,
     "cloud": 1.0,
-    "map/occupied": 1.0,
 }
 SHARED = ("tf", "tf_static", "diagnostics", "rosout", "clock")  # what ROS keeps outside any namespace
 STATIONS = 16  # sessions at most
