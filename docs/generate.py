@@ -1,8 +1,8 @@
 """Writes the generated pages of docs/: run `python docs/generate.py` after a change of the code.
 
 What flights gave comes from the folders of flights: `python docs/generate.py flights/demo flights/look flights/live`.
-Where README and docs say `<!-- table: MISSION -->`, `<!-- table: live -->` or `<!-- why: MISSION -->` the block
-that follows is replaced; the first folder also gives docs/reference/performance.md. A test compares the other pages
+Where README and docs say `<!-- table: MISSION -->`, `<!-- table: live -->`, `<!-- why: MISSION -->` or
+`<!-- map: MISSION -->` the block that follows is replaced; the first folder also gives docs/reference/performance.md. A test compares the other pages
 with the code.
 """
 
@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.cli.live_outcome import live_table
+from companion.cli.map import info_text
 from companion.cli.outcome import outcome_table
 from companion.config import Config, dump_config
 from companion.core import topics
@@ -105,7 +106,11 @@ def flown_blocks(folder: Path, flown: Summary) -> dict[str, str]:
     """Marker -> what stands in the block after it."""
     table = _as_text(outcome_table(flown, folder / "flight.png"))
     reasons = (folder / "why.log").read_text(encoding="utf-8").splitlines()
-    return {f"table: {flown.mission}": table, f"why: {flown.mission}": "\n".join([*reasons[:6], "...", *reasons[-2:]])}
+    return {
+        f"table: {flown.mission}": table,
+        f"why: {flown.mission}": "\n".join([*reasons[:6], "...", *reasons[-2:]]),
+        f"map: {flown.mission}": info_text(folder),
+    }
 
 
 def live_blocks(folder: Path) -> dict[str, str]:

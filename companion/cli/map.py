@@ -21,7 +21,7 @@ from companion.mapping.formats.umap import Progress
 from companion.runtime.map_file import READABLE, WRITABLE, check_writable, map_path, read_map, write_file, write_map
 
 _File = Annotated[Path, typer.Argument(help=f"A map ({', '.join(READABLE)}), or the folder of a flight.")]
-_PICTURES = (".png", ".svg", ".pdf")
+_PICTURES = (".png", ".jpg", ".svg", ".pdf")
 
 
 def info(
@@ -29,16 +29,16 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Say what FILE holds, and try its checksum. Example: companion map info flights/demo"""
-    path = map_path(file)
-    facts = facts_of(_read(path))
-    checksum = "ok" if path.suffix.lower() == ".umap" else "none in this format"
-    more = {"file": str(path), "bytes": path.stat().st_size, "checksum": checksum}
+    more, facts = _facts(file)
     if as_json:
         typer.echo(msgspec.json.encode(more | msgspec.structs.asdict(facts)).decode())
         return
-    console = Console(highlight=False, soft_wrap=True)
-    for name, text in _rows(more, facts).items():
-        console.print(f"{name:<14}{text}", markup=False)
+    Console(highlight=False, soft_wrap=True).print(_text(more, facts), markup=False)
+
+
+def info_text(file: Path) -> str:
+    """What `info` prints."""
+    return _text(*_facts(file))
 
 
 def convert(
@@ -100,6 +100,17 @@ def view(
 def _read(file: Path) -> StoredMap:
     with _progress(f"reading {file.name}") as on_progress:
         return read_map(file, on_progress=on_progress)
+
+
+def _facts(file: Path) -> tuple[dict[str, Any], MapFacts]:
+    path = map_path(file)
+    facts = facts_of(_read(path))
+    checksum = "ok" if path.suffix.lower() == ".umap" else "none in this format"
+    return {"file": str(path), "bytes": path.stat().st_size, "checksum": checksum}, facts
+
+
+def _text(more: dict[str, Any], facts: MapFacts) -> str:
+    return "\n".join(f"{name:<14}{text}" for name, text in _rows(more, facts).items())
 
 
 def _rows(more: dict[str, Any], facts: MapFacts) -> dict[str, str]:

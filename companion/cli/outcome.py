@@ -21,7 +21,7 @@ from companion.report.summary import Summary, to_json, trajectory_figures
 from companion.report.tracks import Tracks
 from companion.runtime.flight import Flight
 from companion.runtime.flight_log import FlightLog
-from companion.runtime.map_file import save_map
+from companion.runtime.map_file import MAP_FILE, save_map
 
 if TYPE_CHECKING:
     from companion.cli.fly import Request
@@ -54,7 +54,7 @@ def write_outcome(
     (out / "config.yaml").write_text(dump_config(request.config), encoding="utf-8")
     (out / "simulator.yaml").write_text(sim.describe(), encoding="utf-8")
     _write_why(out / "why.log", tracks)
-    save_map(out / "map.npz", stack)
+    save_map(out / MAP_FILE, stack)
     picture = out / "flight.png"
     title = headline(summary.mission, summary.world, summary.seed, summary.reason, msgspec.structs.asdict(summary))
     draw_flight(picture, tracks, scenery_of(sim.world), title)

@@ -28,7 +28,7 @@ _COLORS = "viridis"
 
 
 def draw_map(stored: StoredMap, path: Path, title: str) -> None:
-    """Write the picture (.png, .svg, .pdf); InputError if nothing in the map is occupied."""
+    """Write the picture (.png, .jpg, .svg, .pdf); InputError if nothing in the map is occupied."""
     centers, _ = stored.occupied()
     if len(centers) == 0:
         raise InputError("no voxel is occupied: there is nothing to draw", field="map")
@@ -50,8 +50,9 @@ def draw_map(stored: StoredMap, path: Path, title: str) -> None:
 def draw_grid(grid: Grid2D, path: Path, title: str) -> None:
     """Write a picture of a 2D grid: free light, occupied dark, unknown in the colour of the page's edge."""
     style.apply()
-    figure, axes = plt.subplots(figsize=(7.0, 6.2), layout="constrained")
     size = np.array(grid.probability.shape) * grid.resolution_m
+    tall = float(np.clip(5.8 * size[1] / size[0], 2.0, 9.0))
+    figure, axes = plt.subplots(figsize=(7.0, tall + 0.8), layout="constrained")
     x, y = grid.origin_xy
     extent = (x, x + size[0], y, y + size[1])
     axes.set_facecolor(style.GROUND)

@@ -11,9 +11,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from companion.core.messages import Array
+from companion.core.messages import Array, Array32
 
 _LIGHT = (0.80, 0.62, 1.0)  # of faces across x, y, z
 _DEPTH_STEP_M = 1e-3
@@ -21,6 +22,7 @@ _INDEX_BITS, _FACE_BITS = 32, 2
 _EDGE_REACH = (1, 2, 4)  # pixels
 _EDGE_STRENGTH = 0.28
 _LARGEST_CUBE = 40  # pixels
+_MOST_PIXELS = 3e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,18 +46,19 @@ NORTHWARD = View(math.radians(90.0), 0.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """`rgba` (H, W, 4) in 0 .. 1; `extent`: left, right, bottom, top, m along the picture."""
+    """`rgba` (H, W, 4); `extent`: left, right, bottom, top, m along the picture."""
 
-    rgba: Array
+    rgba: NDArray[np.uint8]
     extent: tuple[float, float, float, float]
 
 
 def render(centers: Array, colors: Array, edge_m: float, view: View, width_px: int) -> Picture:
-    """The cubes at `centers` (N, 3), of `edge_m`, in `colors` (N, 3) of 0 .. 1; N > 0."""
+    """The cubes at `centers` (N, 3), of `edge_m`, in `colors` (N, 3) of 0 .. 1; N > 0. At most `width_px` wide."""
     placed = centers @ view.axes.T
     half = edge_m * 0.5 * np.abs(view.axes).sum(axis=1)[:2].max()
     low, high = placed[:, :2].min(axis=0) - half, placed[:, :2].max(axis=0) + half
-    per_m = min(width_px / float(high[0] - low[0]), _LARGEST_CUBE / edge_m)
+    wide, tall = (float(v) for v in high - low)
+    per_m = min(width_px / wide, math.sqrt(_MOST_PIXELS / (wide * tall)), _LARGEST_CUBE / edge_m)
     shape = tuple(int(n) for n in np.ceil((high - low) * per_m)[::-1])
     pixel = np.floor((placed[:, :2] - low) * per_m).astype(np.int64)
     depth = placed[:, 2] - placed[:, 2].min() + edge_m
@@ -86,38 +89,47 @@ def _cube(edge_m: float, view: View, per_m: float) -> Array:
 def _fill(shape: tuple[int, ...], pixel: NDArray[np.int64], depth: Array, cube: Array) -> NDArray[np.int64]:
     """The nearest face per pixel (H, W), as nearness | number of the voxel | face; 0: none."""
     buffer = np.zeros(shape, np.int64)
-    flat, number = buffer.reshape(-1), np.arange(len(depth), dtype=np.int64) << _FACE_BITS
-    farthest = int(depth.max() / _DEPTH_STEP_M) + 10**7
-    for right, up, offset, face in cube:
-        x, y = pixel[:, 0] + int(right), pixel[:, 1] + int(up)
-        inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
-        nearness = farthest - np.rint((depth + offset) / _DEPTH_STEP_M).astype(np.int64)
-        key = nearness << (_INDEX_BITS + _FACE_BITS) | number | int(face)
-        np.maximum.at(flat, (y * shape[1] + x)[inside], key[inside])
+    steps = np.rint(cube[:, 2] / _DEPTH_STEP_M).astype(np.int64)
+    stamp = np.column_stack([cube[:, :2].astype(np.int64), steps, cube[:, 3].astype(np.int64)])
+    deep = np.rint(depth / _DEPTH_STEP_M).astype(np.int64)
+    _stamp(buffer, pixel, int(deep.max()) + int(np.abs(steps).max()) + 1 - deep, stamp)
     return buffer
 
 
-def _shade(buffer: NDArray[np.int64], colors: Array, light: Array, edge_m: float) -> Array:
+@njit(cache=True, nogil=True)
+def _stamp(buffer, pixel, nearness, stamp):  # type: ignore[no-untyped-def]
+    height, width = buffer.shape
+    for n in range(len(pixel)):
+        for k in range(len(stamp)):
+            x, y = pixel[n, 0] + stamp[k, 0], pixel[n, 1] + stamp[k, 1]
+            if 0 <= x < width and 0 <= y < height:
+                near = nearness[n] - stamp[k, 2]
+                key = near << (_INDEX_BITS + _FACE_BITS) | n << _FACE_BITS | stamp[k, 3]
+                buffer[y, x] = max(buffer[y, x], key)
+
+
+def _shade(buffer: NDArray[np.int64], colors: Array, light: Array, edge_m: float) -> NDArray[np.uint8]:
     """Colour (H, W, 4) of each pixel: that of its voxel, by the light (3,) on the face, darker behind edges."""
-    drawn = buffer > 0
-    number = (buffer >> _FACE_BITS) & ((1 << _INDEX_BITS) - 1)
-    nearness = (buffer >> (_INDEX_BITS + _FACE_BITS)) * _DEPTH_STEP_M
-    lit = light[buffer & ((1 << _FACE_BITS) - 1)] * _behind_edges(np.asarray(nearness, np.float64), edge_m)
-    rgba = np.zeros((*buffer.shape, 4))
-    rgba[drawn, :3] = colors[number[drawn]] * lit[drawn, None]
-    rgba[..., 3] = drawn
+    y, x = np.nonzero(buffer)
+    drawn = buffer[y, x]
+    number = (drawn >> _FACE_BITS) & ((1 << _INDEX_BITS) - 1)
+    lit = light[drawn & ((1 << _FACE_BITS) - 1)] * _behind_edges(buffer, edge_m)[y, x]
+    rgba = np.zeros((*buffer.shape, 4), np.uint8)
+    rgba[y, x, :3] = np.rint(255.0 * colors[number] * lit[:, None])
+    rgba[y, x, 3] = 255
     return rgba
 
 
-def _behind_edges(nearness: Array, edge_m: float) -> Array:
-    """Light (H, W) that is left beside nearer neighbours; a step of four voxels takes all it can."""
-    shadow, count = np.zeros(nearness.shape), 0
-    padded = np.pad(nearness, max(_EDGE_REACH))
+def _behind_edges(buffer: NDArray[np.int64], edge_m: float) -> Array32:
+    """Light (H, W) that is left beside nearer neighbours; a step of five voxels takes all it can."""
+    nearness = (buffer >> (_INDEX_BITS + _FACE_BITS)).astype(np.float32)
+    nearness *= np.float32(_DEPTH_STEP_M / (4 * edge_m))
+    shadow, margin = np.zeros_like(nearness), max(_EDGE_REACH)
+    padded = np.pad(nearness, margin)
     height, width = nearness.shape
     for reach in _EDGE_REACH:
         for dx, dy in ((reach, 0), (-reach, 0), (0, reach), (0, -reach)):
-            y, x = max(_EDGE_REACH) + dy, max(_EDGE_REACH) + dx
-            step = padded[y : y + height, x : x + width] - nearness
-            shadow += np.clip(step / (4 * edge_m) - 0.25, 0.0, 1.0)
-            count += 1
-    return np.asarray(np.exp(-shadow * (_EDGE_STRENGTH * 12 / count)))
+            step = padded[margin + dy : margin + dy + height, margin + dx : margin + dx + width] - nearness
+            step -= np.float32(0.25)
+            shadow += np.clip(step, 0.0, 1.0, out=step)
+    return np.asarray(np.exp(-_EDGE_STRENGTH * shadow), np.float32)

@@ -37,7 +37,7 @@ from companion.runtime.live import InboxLog as Log
 from companion.runtime.live import LiveGroup, LiveNode, Outlet
 from companion.runtime.lockstep import name
 from companion.runtime.log_file import Header
-from companion.runtime.map_file import save_map
+from companion.runtime.map_file import MAP_FILE, save_map
 from companion.runtime.monitor import Monitor
 from companion.runtime.no_log import NoLog
 from companion.runtime.pipes import Assignment, Beat, NodeBeat, Word
@@ -165,7 +165,7 @@ class Process:
         if hanging:
             print(f"still busy at the end: {', '.join(hanging)}", file=sys.stderr)
         else:
-            save_map(Path(self._assignment.out) / "map.npz", self._nodes)
+            save_map(Path(self._assignment.out) / MAP_FILE, self._nodes)
         return 0
 
     def _hear(self) -> None:
