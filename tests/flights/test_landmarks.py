@@ -76,5 +76,5 @@ def test_trunks_are_where_they_stand_and_keypoints_on_the_ground(fly):
     assert found["trunk_xy_rms_m"] < 0.10
     assert found["trunk_z_rms_m"] < 0.15
     assert found["trunk_diameter_rms_m"] < 0.06
-    assert found["visual"] > 1000
+    assert found["visual"] > 600
     assert found["visual_height_rms_m"] < 0.12
