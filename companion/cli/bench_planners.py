@@ -99,7 +99,7 @@ def cells(row: PlannerRow) -> list[str]:
         row.planner,
         f"{100 * row.success:.0f} %",
         *lengths,
-        f"{row.cpu_ms:.3g}",
+        f"{row.cpu_ms:.0f}" if row.cpu_ms >= 100 else f"{row.cpu_ms:.3g}",
         f"{row.work:.0f}",
         row.unit,
         again,

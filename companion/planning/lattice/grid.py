@@ -22,6 +22,7 @@ from companion.planning.lattice.moves import PLANE, Corners, Neighbours, moves_o
 from companion.planning.lattice.search import CLOSED, search, walk_back
 from companion.planning.lattice.theta_star import chain, theta_star
 
+_HERE = 2  # bit of a cell in its own place of `_blocked`
 _MOST_CELLS = 2**31 - 1
 MOST_WEIGHT = 5.0  # the ring of the open list holds no more
 
@@ -79,7 +80,9 @@ class Lattice:
         self.neighbours = neighbours
         self._shape = np.array(padded.shape, np.int64)
         self._strides = np.array([self._shape[1] * self._shape[2], self._shape[2], 1], np.int64)
-        self._blocked = padded.ravel()
+        self._blocked = padded.ravel() << 1  # bits: blocked below, here, above
+        self._blocked[1:] |= padded.ravel()[:-1]
+        self._blocked[:-1] |= padded.ravel()[1:] << 2
         moves = moves_of(neighbours, corners)
         self._flat = (moves.offsets @ self._strides).astype(np.int64)
         self._moves = (self._flat, moves.offsets, moves.lengths, moves.needs, moves.natural)
@@ -151,7 +154,7 @@ class Lattice:
         if np.any(places < 0) or np.any(places >= self._shape - 2):
             return None
         nodes = (places + 1) @ self._strides
-        return None if self._blocked[nodes].any() else (int(nodes[0]), int(nodes[1]))
+        return None if (self._blocked[nodes] & _HERE).any() else (int(nodes[0]), int(nodes[1]))
 
     def _nothing(self, start: Sequence[int]) -> Found:
         none = np.empty((0, self._dimensions), np.int64)

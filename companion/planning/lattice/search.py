@@ -28,9 +28,9 @@ SAME = 1e-9  # cells; less is rounding
 def search(blocked, shape, moves, ends, bound, scratch):  # type: ignore[no-untyped-def]
     """Cost of the way, number of expansions, and every node seen.
 
-    blocked (V,), shape (3,) of the padded grid; moves = flat offsets (M,) and the arrays of `Moves`;
-    ends = start, goal; bound = heuristic's number, weight, whether the cost must be the least; scratch = label (V,),
-    all 0, cost (V,), given (V,): they hold the answer.
+    blocked (V,), bits of the cells below, at and above each; shape (3,) of the padded grid; moves = flat offsets (M,)
+    and the arrays of `Moves`; ends = start, goal; bound = heuristic's number, weight, whether the cost must be the
+    least; scratch = label (V,), all 0, cost (V,), given (V,): they hold the answer.
     """
     start, goal = ends
     label, cost, given = scratch
@@ -116,23 +116,22 @@ def walk_back(flat, ends, label):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def surroundings(blocked, v, shape):  # type: ignore[no-untyped-def]
-    """Bit set of the blocked cells among the 27 around a node."""
-    walls, bit = np.uint32(0), np.uint32(1)
+    """Bit set of the blocked cells among the 27 around a node; `blocked` holds three of a column in each place."""
+    walls, place = np.uint32(0), np.uint32(0)
     for a in range(-1, 2):
         for b in range(-1, 2):
-            low = v + (a * shape[1] + b) * shape[2] - 1
-            for c in range(3):
-                if blocked[low + c]:
-                    walls |= bit
-                bit <<= np.uint32(1)
+            walls |= np.uint32(blocked[v + (a * shape[1] + b) * shape[2]]) << place
+            place += np.uint32(3)
     return walls
 
 
 @njit(cache=True, nogil=True)
 def unflat(v, shape):  # type: ignore[no-untyped-def]
     """Indices along the axes."""
-    row = v // shape[2]
-    return row // shape[1], row % shape[1], v % shape[2]
+    height, width = np.uint32(shape[2]), np.uint32(shape[1])
+    row = np.uint32(v) // height  # unsigned: half the time of signed division
+    i = row // width
+    return np.int64(i), np.int64(row - i * width), np.int64(np.uint32(v) - row * height)
 
 
 @njit(cache=True, nogil=True)
