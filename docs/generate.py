@@ -2,8 +2,8 @@
 
 What flights gave comes from the folders of flights: `python docs/generate.py flights/demo flights/look flights/live`.
 Where README and docs say `<!-- table: MISSION -->`, `<!-- table: live -->`, `<!-- why: MISSION -->` or
-`<!-- map: MISSION -->` the block that follows is replaced; the first folder also gives docs/reference/performance.md. A test compares the other pages
-with the code.
+`<!-- map: MISSION -->` the block that follows is replaced; the first folder also gives
+docs/reference/performance.md. A test compares the other pages with the code.
 """
 
 from __future__ import annotations
