@@ -13,7 +13,7 @@ import numpy as np
 
 from companion.core.messages import Array
 from companion.planning.lattice.grid import MOST_WEIGHT, Found, Lattice, Scratch
-from companion.planning.lattice.heuristics import Heuristic, admissible
+from companion.planning.lattice.heuristics import Heuristic, admissible, heuristic_code
 from companion.planning.lattice.moves import Neighbours
 from companion.planning.planner import CellSpace, Plan, Proof, refused
 from companion.planning.polyline import length
@@ -33,9 +33,16 @@ class LatticeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class AStar:
-    """The shortest way along neighbouring cells, from centre to centre but for the ends."""
+    """The shortest way along neighbouring cells, from centre to centre but for the ends.
+
+    Raises InputError for a heuristic that does not fit the neighbours.
+    """
 
     def __init__(self, config: LatticeConfig) -> None:
+        weighted = config.weighted
+        heuristic_code(
+            config.heuristic, config.neighbours, weight=config.weight, weighted=weighted
+        )  # before the flight
         self.config = config
         self._scratch: Scratch | None = None
         self.closed = np.empty((0, 3), np.int64)
@@ -51,10 +58,7 @@ class AStar:
         iterations: int,
         known_path: Array | None = None,
     ) -> Plan:
-        """Ends by itself: `iterations`, `rng` and `known_path` change nothing. Plan.iterations are expansions.
-
-        Raises InputError for a heuristic that does not fit the neighbours.
-        """
+        """Ends by itself: `iterations`, `rng` and `known_path` change nothing. Plan.iterations are expansions."""
         refusal = refused(start, goal, space)
         if refusal is not None:
             return refusal

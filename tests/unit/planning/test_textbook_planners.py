@@ -4,6 +4,7 @@ import heapq
 import itertools
 import math
 import zlib
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 
 from companion.core.errors import InputError
 from companion.planning.grid_space import GridSpace
-from companion.planning.planner import Plan
+from companion.planning.lattice.planner import LatticeConfig
+from companion.planning.planner import Plan, PlannerName
 from companion.planning.polyline import length
 from companion.planning.registry import PLANNERS, PlannerSettings, make_planner
 from companion.planning.roadmap import PRM, Roadmap, RoadmapConfig, build_roadmap, star_radius_m
@@ -90,6 +92,23 @@ def test_ends_that_are_blocked_or_outside_are_refused(name, pillars):
 def test_an_unknown_name_gives_the_valid_ones():
     with pytest.raises(InputError, match=r"'dstar' is no planner \(valid: rrt_star, rrt, .*theta_star"):
         make_planner("dstar", PlannerSettings())
+
+
+def test_the_configuration_knows_the_planners_of_the_registry():
+    assert set(get_args(PlannerName)) == set(PLANNERS)
+
+
+def test_a_heuristic_that_does_not_fit_is_refused_before_the_flight():
+    with pytest.raises(InputError, match="manhattan with 26 neighbours may exceed"):
+        make_planner("astar", PlannerSettings(lattice=LatticeConfig(heuristic="manhattan")))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_cost_of_rrt_star_never_rises_with_iterations(plane, pillars, seed):
+    for space, ends in ((plane, ENDS_2D), (pillars, (START, GOAL))):
+        plans = [ask("rrt_star", space, ends, seed=seed, iterations=n) for n in (100, 300, 1000, 3000, 9000)]
+        costs = [plan.cost_m for plan in plans]
+        assert costs == sorted(costs, reverse=True) and costs[-1] < math.inf
 
 
 # --- RRT --------------------------------------------------------------------------------------------
