@@ -15,18 +15,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.core.messages import Array, Array32
+from companion.mapping.lanes import FRACTION, LANES, write_indices
+from companion.mapping.ray_lines import COUNT, FINE, FIRST, HITS, LAST, SIGN, TILE, ends, line_scratch, planes, slopes
 
 u8, u32, u64 = np.uint8, np.uint32, np.uint64  # unsigned: no negative-index handling in kernels
 BLOCK = 8  # voxels per block edge; 8^3 bits are one cache line
 CELLS = BLOCK**3
 WORDS = CELLS // 64
-_FRACTION = 44  # bits after the point: an error of 2e-11 voxels after 300 planes
-_ONE = float(1 << _FRACTION)
+_CUT = FINE - FRACTION  # bits cut off where 32 must do
 _STRIDES = (BLOCK * BLOCK, BLOCK, 1)  # of x, y, z inside a block
 _INSIDE = 2  # blocks of slack around the farthest voxel
-_BATCH = 8192  # voxel indices collected before their bits are set
-_CHUNK = 32  # a family is written in whole chunks
-_STEEPEST = 1024.0  # slope bound; a steeper family has a single voxel, whose slope does not matter
 
 
 class RayGrid:
@@ -45,7 +43,8 @@ class RayGrid:
         self.hit = np.zeros(count * WORDS, np.uint64)
         self.corner = np.zeros(3, np.int64)
         self._reached = np.zeros((2, 3), np.int64)  # lowest and highest cell of any bit
-        self._row = np.zeros(_BATCH + 3 * BLOCK * self.side + _CHUNK, np.uint32)
+        self._row = np.zeros(TILE * 3 * BLOCK * self.side + LANES, np.uint32)
+        self._lines = line_scratch()
         blocks = np.array([self.side**2, self.side, 1]) * CELLS
         strides = np.array(_STRIDES)
         self._strides = np.stack([strides, blocks - BLOCK * strides])  # index = x * [0] + (x >> 3) * [1]
@@ -72,7 +71,9 @@ class RayGrid:
         start = origin * scale - BLOCK * self.corner
         bits = (self.free.view(np.uint8), self.hit.view(np.uint8), self._reached)
         pose = (np.ascontiguousarray(R * scale), offset * scale, start)
-        used, steps = _cast(vectors, pose, (near_m, far_m * scale, miss), bits, self._row, self._strides)
+        used, steps = _cast(
+            vectors.reshape(-1), pose, (near_m, far_m * scale, miss), bits, self._row, self._strides, self._lines
+        )
         return int(used), int(steps)
 
     def mark_free(self, points_odom: Array) -> None:
@@ -95,127 +96,83 @@ class RayGrid:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cast(vectors, pose, ranges, bits, row, strides):  # type: ignore[no-untyped-def]
-    """One pass over the rays; all lengths in voxels, except `near` in the unit of `vectors`."""
-    start = pose[2]
+def _cast(vectors, pose, ranges, bits, row, strides, lines):  # type: ignore[no-untyped-def]
+    """Tile by tile: the lines of its rays, then the indices of their voxels, then the bits."""
     free, hit, reached = bits
-    cell = (int(start[0]), int(start[1]), int(start[2]))
-    used = steps = end = 0
-    for i in range(vectors.shape[0]):
-        counts, cut, d = _ray(vectors[i], pose, ranges)
-        if not counts:
-            continue
-        used += 1
-        last = (int(start[0] + d[0]), int(start[1] + d[1]), int(start[2] + d[2]))
-        _reach(reached, last)
-        if not cut:
-            index = _index(last[0], last[1], last[2], strides)
-            _set_bit(hit, index)
-            _set_bit(free, index)
-        end = _crossed(row, end, ((start[0], start[1], start[2]), cell, last, d, cut), strides)
-        if end > _BATCH:
-            steps += _set_bits(free, row[:end])
-            end = 0
-    steps += _set_bits(free, row[:end])
+    R, offset, origin = pose
+    start, whole = (origin[0], origin[1], origin[2]), lines[2]
+    turn = (R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2])
+    flat_pose = (turn, (offset[0], offset[1], offset[2]), start)
+    used = steps = 0
+    for first in range(0, vectors.size // 3, TILE):
+        count = min(TILE, vectors.size // 3 - first)
+        used += ends(vectors, (first, count), flat_pose, ranges, lines)
+        planes(count, start, lines)
+        for axis in range(3):
+            slopes(count, start, lines, axis)
+        _reach(reached, whole, count)
+        end = _families(row, count, lines, strides)
+        steps += _set_bits(free, row[:end])
+        for n in range(count):
+            if whole[HITS + n] != 0:
+                index = _index(whole[LAST + n], whole[LAST + TILE + n], whole[LAST + 2 * TILE + n], strides)
+                _set_bit(hit, index)
+                _set_bit(free, index)
     if used > 0:
-        _reach(reached, cell)
-        _set_bit(free, _index(cell[0], cell[1], cell[2], strides))
+        _set_bit(free, _index(int(start[0]), int(start[1]), int(start[2]), strides))
     return used, steps
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ray(vector, pose, ranges):  # type: ignore[no-untyped-def]
-    """Whether a ray counts, whether it ends without a hit, and its way in voxels, at most `far` long."""
-    R, offset, _ = pose
-    near, far, miss = ranges
-    a, b, c = np.float64(vector[0]), np.float64(vector[1]), np.float64(vector[2])
-    dx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + offset[0]
-    dy = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + offset[1]
-    dz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + offset[2]
-    length2 = dx * dx + dy * dy + dz * dz
-    counts = 0.0 < length2 < 1e18 and a * a + b * b + c * c >= near * near  # NaN fails, too
-    cut = miss or length2 > far * far
-    shrink = far / math.sqrt(length2) if cut else 1.0
-    return counts, cut, (dx * shrink, dy * shrink, dz * shrink)
-
-
 @njit(cache=True, nogil=True)
-def _reach(reached, cell):  # type: ignore[no-untyped-def]
+def _reach(reached, whole, count):  # type: ignore[no-untyped-def]
     for k in range(3):
-        reached[0, k] = min(reached[0, k], cell[k])
-        reached[1, k] = max(reached[1, k], cell[k])
+        low, high = reached[0, k], reached[1, k]
+        for n in range(LAST + k * TILE, LAST + k * TILE + count):
+            low, high = min(low, whole[n]), max(high, whole[n])
+        reached[0, k], reached[1, k] = low, high
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _crossed(row, end, ray, strides):  # type: ignore[no-untyped-def]
-    """Write the voxels that a ray enters behind the first `end` indices; returns the new end."""
-    (ox, oy, oz), (ix, iy, iz), (jx, jy, jz), (dx, dy, dz), cut = ray
-    x_stride = (u32(strides[0, 0]), u32(strides[1, 0]))
-    y_stride = (u32(strides[0, 1]), u32(strides[1, 1]))
-    z_stride = (u32(strides[0, 2]), u32(strides[1, 2]))
-    nx, ny, nz = abs(jx - ix), abs(jy - iy), abs(jz - iz)  # planes crossed
-    (sx, tx, gx), (sy, ty, gy), (sz, tz, gz) = _planes(ox, ix, dx), _planes(oy, iy, dy), _planes(oz, iz, dz)
-    if cut and nx + ny + nz > 0:  # OctoMap's choice: the voxel of the cut is not seen
-        nx, ny, nz = _without_last((nx, ny, nz), (tx, ty, tz), (gx, gy, gz))
-    _family(row, end, (nx, ix + sx, sx, x_stride), (tx, gx), (oy, dy, y_stride), (oz, dz, z_stride))
-    end += nx
-    _family(row, end, (ny, iy + sy, sy, y_stride), (ty, gy), (ox, dx, x_stride), (oz, dz, z_stride))
-    end += ny
-    _family(row, end, (nz, iz + sz, sz, z_stride), (tz, gz), (ox, dx, x_stride), (oy, dy, y_stride))
-    return end + nz
+def _families(row, count, lines, strides):  # type: ignore[no-untyped-def]
+    """Indices of the voxels that `count` rays enter, at the planes of one axis after another; returns their end.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _planes(o, i, d):  # type: ignore[no-untyped-def]
-    """Of one axis: direction, share of the ray to its first plane, share from plane to plane."""
-    gap = 1.0 / abs(d)
-    return (1, (i + 1 - o) * gap, gap) if d > 0 else (-1, (o - i) * gap, gap)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _without_last(counts, first, gaps):  # type: ignore[no-untyped-def]
-    """Planes per axis less the one that is crossed last."""
-    nx, ny, nz = counts
-    last_x = first[0] + (nx - 1) * gaps[0] if nx > 0 else -1.0
-    last_y = first[1] + (ny - 1) * gaps[1] if ny > 0 else -1.0
-    last_z = first[2] + (nz - 1) * gaps[2] if nz > 0 else -1.0
-    if last_x >= last_y and last_x >= last_z:
-        return nx - 1, ny, nz
-    if last_y >= last_z:
-        return nx, ny - 1, nz
-    return nx, ny, nz - 1
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _family(row, end, planes, times, axis_u, axis_v):  # type: ignore[no-untyped-def]
-    """Indices of the voxels entered at `count` planes of one axis; u and v are the other two.
-
-    Writes whole chunks, so garbage may follow the `count` indices.
+    Writes whole lanes, so garbage may follow.
     """
-    count, w0, step, (sw, bw) = planes
-    t0, dt = times
-    u0, du, (su, bu) = axis_u
-    v0, dv, (sv, bv) = axis_v
-    u, v, w = _fixed(u0 + du * t0), _fixed(v0 + dv * t0), u32(w0)
-    u_step = _fixed(min(max(du * dt, -_STEEPEST), _STEEPEST))
-    v_step = _fixed(min(max(dv * dt, -_STEEPEST), _STEEPEST))
-    w_step = u32(step)
-    for first in range(0, count, _CHUNK):
-        chunk = row[end + first : end + first + _CHUNK]
-        for j in range(_CHUNK):
-            k = u64(first + j)
-            iu = u32((u + k * u_step) >> u64(_FRACTION))
-            iv = u32((v + k * v_step) >> u64(_FRACTION))
-            iw = u32(w + u32(u32(k) * w_step))
-            along_u = u32(u32(iu * su) + u32(u32(iu >> u32(3)) * bu))
-            along_v = u32(u32(iv * sv) + u32(u32(iv >> u32(3)) * bv))
-            along_w = u32(u32(iw * sw) + u32(u32(iw >> u32(3)) * bw))
-            chunk[j] = u32(u32(along_u + along_v) + along_w)
+    _, fixed, whole = lines
+    end = 0
+    for n in range(count):
+        for axis in range(3):  # u and v are the other two
+            axis_u, axis_v = 1 if axis == 0 else 0, 1 if axis == 2 else 2
+            crossed, sign = (whole[COUNT + axis * TILE + n], u32(whole[SIGN + axis * TILE + n]))
+            w = u32(u32(whole[FIRST + axis]) + sign)
+            at = 4 * axis * TILE + n
+            u, v, u_step, v_step = (fixed[at], fixed[at + TILE], fixed[at + 2 * TILE], fixed[at + 3 * TILE])
+            in_u = (u32(u_step >> u64(_CUT)), u32(strides[0, axis_u]), u32(strides[1, axis_u]))
+            in_v = (u32(v_step >> u64(_CUT)), u32(strides[0, axis_v]), u32(strides[1, axis_v]))
+            in_w = (sign, u32(strides[0, axis]), u32(strides[1, axis]))
+            for first in range(end, end + crossed, LANES):
+                now = (u32(u >> u64(_CUT)), u32(v >> u64(_CUT)), w)
+                if write_indices(row, first, now, in_u, in_v, in_w) != u64(0):
+                    _exact(row[first : first + LANES], (u, v, w), (u_step, v_step), (in_u, in_v, in_w))
+                u, v, w = (u + u64(LANES) * u_step, v + u64(LANES) * v_step, u32(w + u32(u32(LANES) * sign)))
+            end += crossed
+    return end
 
 
-@njit(cache=True, nogil=True)
-def _fixed(x):  # type: ignore[no-untyped-def]
-    return u64(np.int64(x * _ONE))
+@njit(cache=True, nogil=True, error_model="numpy")
+def _exact(chunk, now, fixed_steps, axes):  # type: ignore[no-untyped-def]
+    """The same lanes in full precision."""
+    (u, v, w), (u_step, v_step) = now, fixed_steps
+    (_, su, bu), (_, sv, bv), (w_step, sw, bw) = axes
+    for j in range(LANES):
+        k = u64(j)
+        iu = u32((u + k * u_step) >> u64(FINE))
+        iv = u32((v + k * v_step) >> u64(FINE))
+        iw = u32(w + u32(u32(k) * w_step))
+        along_u = u32(u32(iu * su) + u32(u32(iu >> u32(3)) * bu))
+        along_v = u32(u32(iv * sv) + u32(u32(iv >> u32(3)) * bv))
+        along_w = u32(u32(iw * sw) + u32(u32(iw >> u32(3)) * bw))
+        chunk[j] = u32(u32(along_u + along_v) + along_w)
 
 
 @njit(cache=True, nogil=True)
