@@ -14,9 +14,11 @@ from pathlib import Path
 import msgspec
 
 from companion.core.errors import InputError
+from companion.runtime.bench.mapping_cycle import time_cycle
 from companion.runtime.bench.mapping_field import FieldPeer, time_field
 from companion.runtime.bench.mapping_forest import DENSE, FLIGHT_SCANS, OPEN, Lidar, fly, make_forest
 from companion.runtime.bench.mapping_insert import agreement, time_insertion
+from companion.runtime.bench.mapping_memory import memory_figures
 from companion.runtime.bench.mapping_scans import PAIR, VELODYNE, Scan, pair_scans, velodyne_scans
 from companion.runtime.bench.mapping_thin import Thin, thin_recall
 
@@ -131,6 +133,15 @@ def _field(peer_name: FieldPeer, options: Options) -> tuple[str, dict[str, float
     return peer_name, time_field(scans, peer_name, rounds=options.rounds)
 
 
+def _cycle(options: Options) -> tuple[str, dict[str, float]]:
+    scans = list(_forest_scans("os64", range(_TIMED_FROM, _TIMED_FROM + _TIMED)))
+    return "OctoMap's insertion alone", time_cycle(scans, rounds=options.rounds)
+
+
+def _memory(_: Options) -> tuple[str, dict[str, float]]:
+    return "", memory_figures()
+
+
 def _thin(kind: Thin, lidar: Lidar, resolution_m: float, _: Options) -> tuple[str, dict[str, float]]:
     return "OctoMap", thin_recall(kind, lidar, resolution_m)
 
@@ -149,8 +160,10 @@ ROWS: dict[str, tuple[Measurement, _Goal | None]] = {
     "agree_mid360_0.2": (partial(_agree, "mid360", 0.2), _Goal("agreement", 0.9999)),
     "field_edt": (partial(_field, "edt"), _Goal("ratio", 14, 25)),
     "field_scipy": (partial(_field, "scipy"), _Goal("ratio", 32, 55)),
+    "cycle": (_cycle, None),
     "thin_trunks": (partial(_thin, "trunks", "os64", 0.2), _Goal("recall", 0.95)),
     "thin_branches": (partial(_thin, "branches", "os64", 0.2), _Goal("recall", 0.95)),
     "thin_branches_mid360": (partial(_thin, "branches", "mid360", 0.2), _Goal("recall", 0.95)),
     "thin_branches_0.1": (partial(_thin, "branches", "os64", 0.1), _Goal("recall", 0.95)),
+    "memory": (_memory, _Goal("rss_growth_mb", 200, at_most=True)),
 }
