@@ -55,8 +55,15 @@ GROUPS = {  # group -> help, command -> module and function
     "mavlink": ("Look into MAVLink logs.", {"inspect": "mavlink:inspect"}),
     "graph": ("Optimise pose graphs.", {"optimise": "graph:optimise_file"}),
     "map": (
-        "Look into maps, convert, slice and draw them.",
-        {"info": "map:info", "convert": "map:convert", "slice": "map:slice_", "view": "map:view"},
+        "Look into maps, convert, slice and draw them; find ways through them.",
+        {
+            "info": "map:info",
+            "convert": "map:convert",
+            "slice": "map:slice_",
+            "view": "map:view",
+            "roadmap": "map_route:roadmap",
+            "route": "map_route:route",
+        },
     ),
     "bench": (
         "Measure this machine.",
