@@ -75,6 +75,19 @@ first.
 
 {comment}
 
+## Many ways through one map
+
+A roadmap of PRM\\* is built once, kept in the map's file, and asked for ways; what is unknown counts as blocked:
+
+```bash
+companion map roadmap flights/demo --samples 3000
+companion map route flights/demo --from 0,0,2 --to 10,6,2
+```
+
+In Python: `companion.runtime.map_roadmap`, or `build_roadmap`, `Roadmap.to_bytes` and `Roadmap.from_bytes` of
+`companion.planning.roadmap`. A query checks its way again and leaves out edges that the map has closed since, so an old
+roadmap serves a changed map, or a wider vehicle, as long as some way along it is open.
+
 ## Rules of the lattice
 
 - Neighbours: 4 and 8 in a layer; 6, 18 and 26 in space. A diagonal move needs the whole box that it spans free
@@ -86,8 +99,6 @@ first.
 - Against published lengths: on Warframe level A1 (896 x 390 x 255 cells, MovingAI) all 409 queries of the `.3dscen`
   file fit `keep` and all 5,875 of the `.problems` file fit `cut`, to the last published digit
   (`tests/unit/planning/test_warframe.py`, the whole set with `-m slow`).
-- Roadmaps become bytes and come back: `Roadmap.to_bytes`, `Roadmap.from_bytes`. A query leaves out edges that the map
-  has closed since.
 """
 
 
