@@ -11,6 +11,7 @@ from companion.estimation.node import GraphNode, LioNode, LoopNode, PropagatorNo
 from companion.estimation.warm_up import warm_up
 from companion.mapping.landmark_node import LandmarkNode
 from companion.mapping.node import MappingNode
+from companion.mapping.shelf import Shelf
 from companion.mission.model import Mission
 from companion.mission.node import MissionNode
 from companion.planning.node import PlanningNode
@@ -39,15 +40,19 @@ def build(
     seed: int,
     only: Sequence[type[Node]] = NODES,
     signing_key: bytes | None = None,
+    shelf: Shelf | None = None,
 ) -> list[Node]:
-    """The nodes of the stack (or some of them), ready to be run by `companion.runtime`."""
+    """The nodes of the stack (or some of them), ready to be run by `companion.runtime`.
+
+    `shelf` takes what of the map is far away; None: that stays in memory.
+    """
     makers: dict[type[Node], Callable[[], Node]] = {
         SensorsNode: lambda: SensorsNode(config.sensors),
         LioNode: lambda: LioNode(config.estimation, config.rig),
         PropagatorNode: lambda: PropagatorNode(config.estimation),
         GraphNode: lambda: GraphNode(config.estimation, config.rig),
         LoopNode: lambda: LoopNode(config.estimation.loops),
-        MappingNode: lambda: MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m),
+        MappingNode: lambda: MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m, shelf=shelf),
         LandmarkNode: lambda: LandmarkNode(config.mapping.landmarks, config.rig),
         PlanningNode: lambda: PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),
         TrackingNode: lambda: TrackingNode(config.tracking),

@@ -22,6 +22,7 @@ from companion.config import Config, dump_config
 from companion.core.node import Node
 from companion.mission.model import Mission, parse_mission
 from companion.report.tracks import Tracks
+from companion.runtime.file_shelf import FileShelf
 from companion.runtime.flight import Flight
 from companion.runtime.flight import Progress as Where
 from companion.runtime.flight_log import FlightLog
@@ -124,7 +125,7 @@ def _prepare(
     sim: simulation.Simulator, request: Request, log: FlightLog, listeners: list[Tracks]
 ) -> tuple[Flight, list[Node]]:
     """A flight at its start, and the nodes of the stack in it."""
-    stack = build(request.config, request.mission, seed=request.seed)
+    stack = build(request.config, request.mission, seed=request.seed, shelf=FileShelf())
     return Flight([sim.new_node(), *stack], request.config.lockstep, log=log, listeners=listeners), stack
 
 

@@ -10,18 +10,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.mapping.block_hash import EMPTY, enter, find, find_or_make, leave, slot_of
-from companion.mapping.fold import MARKS, fold_bits
-from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid
+from companion.mapping.fold import fold_bits
+from companion.mapping.marks import MarkTable
+from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid, ScanBits
 from companion.mapping.sensor_model import UNKNOWN, Steps
 
 u8, u64 = np.uint8, np.uint64
-Watch = Callable[[NDArray[np.int64], NDArray[np.int64], tuple[NDArray[np.uint64], NDArray[np.uint64]]], None]
+Watch = Callable[[NDArray[np.int64], NDArray[np.int64], ScanBits], None]
 """Sees a scan right before it changes the store: numbers (K,) of the scratch blocks it met, rows (K,)
-of the store, and the bits `free`, `hit` (N, 8) of all scratch blocks."""
+of the store, and the scan's bits."""
 _GROWTH = 4096  # blocks: 2 MB at a time, so that growing never stalls a scan
-_PER_ROW = ("xyz", "log_odds", "changed_at", "seen_ns", "held", "marks", "stirred", "_settled")
-
-_NOT_TAKEN = ("marks", "stirred", "_settled")  # what `take` leaves out
+_TAKEN = ("xyz", "log_odds", "changed_at", "seen_ns", "held", "stirred")  # by `take`, as they are
+_PER_ROW = (*_TAKEN, "_slots", "_settled")
 
 
 class BlockStore:
@@ -29,18 +29,20 @@ class BlockStore:
 
     The arrays of `_PER_ROW` hold one row per block and grow in place: views of them must not
     outlive a call. The first `count` rows are in use; without `remove`, in order of creation.
-    `version` counts the changes of the store.
+    `version` counts the changes of the store. `marking`: folding keeps the marks that decay reads.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, marking: bool = False) -> None:
+        self.marking = marking
         self.count = self.version = 0
         self.xyz = np.zeros((_GROWTH, 3), np.int32)
         self.log_odds = np.zeros((_GROWTH, CELLS), np.int8)
         self.changed_at = np.zeros(_GROWTH, np.int64)  # version in which a cell last changed its class
         self.seen_ns = np.zeros(_GROWTH, np.int64)  # stamp of the newest scan with a ray in the block
         self.held = np.zeros(_GROWTH, np.uint8)  # 1: of a loaded map, which no decay may erase
-        self.marks = np.zeros((_GROWTH, len(MARKS), WORDS), np.uint64)  # see fold.py; evicted blocks lose them
         self.stirred = np.zeros(_GROWTH, np.uint8)  # passes of decay that have to look at the block
+        self._slots = np.zeros(_GROWTH, np.int32)  # in the table of marks; 0: the block has none
+        self._marks = MarkTable()
         self._settled = np.zeros((_GROWTH, WORDS), np.uint64)  # bits: the cell is at the lower clamp
         self._keys = np.full(4 * _GROWTH, EMPTY, np.int64)
         self._rows = np.zeros(4 * _GROWTH, np.int32)
@@ -54,7 +56,12 @@ class BlockStore:
     def memory_bytes(self) -> int:
         """Bytes held, spare capacity included."""
         arrays = [getattr(self, name) for name in _PER_ROW]
-        return sum(int(a.nbytes) for a in (*arrays, self._keys, self._rows))
+        return sum(int(a.nbytes) for a in (*arrays, self._keys, self._rows)) + self._marks.memory_bytes
+
+    @property
+    def marks(self) -> tuple[Any, ...]:
+        """As the kernels of decay want them: (whether they are kept, slots, stirred, table)."""
+        return self.marking, self._slots, self.stirred, self._marks.arrays
 
     def fold(
         self, grid: RayGrid, steps: Steps, stamp_ns: int, watch: Watch | None = None
@@ -72,10 +79,12 @@ class BlockStore:
         self._blank(before, self.count)
         amounts = np.array([steps.hit, steps.miss, steps.lowest, steps.highest], np.int16)
         changed = np.zeros(len(met), np.uint8)
-        words = (grid.free.reshape(-1, WORDS), grid.hit.reshape(-1, WORDS))
         if watch is not None:
-            watch(met, rows, words)
-        fold_bits(met, rows, words, (self.log_odds, self._settled, self.marks, self.stirred), amounts, changed)
+            watch(met, rows, grid.bits)
+        if self.marking:
+            self._marks.reserve(grid.hit_blocks)
+        fold_bits(met, rows, grid.bits, ((self.log_odds, self._settled), self.marks), amounts, changed)
+        grid.cleared()
         self.seen_ns[rows] = stamp_ns
         return len(met), self.xyz[self.mark_changed(rows[changed != 0])]
 
@@ -114,16 +123,17 @@ class BlockStore:
 
     def take(self, rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Copies of everything that the blocks in `rows` (K,) hold, by the name of its array."""
-        return {name: getattr(self, name)[rows] for name in _PER_ROW if name not in _NOT_TAKEN}
+        taken = {name: getattr(self, name)[rows] for name in _TAKEN}
+        return taken | {"marks": self._marks.bits[self._slots[rows]]}
 
     def put(self, blocks: Mapping[str, NDArray[Any]], lowest: int) -> None:
         """Take in blocks as `take` gave them, none of them there; nothing of them has changed."""
         first, last = self.count, self.count + len(blocks["xyz"])
         self._reserve(last)
-        for name, array in blocks.items():
-            getattr(self, name)[first:last] = array
+        for name in _TAKEN:
+            getattr(self, name)[first:last] = blocks[name]
         self._settled[first:last] = _settled(blocks["log_odds"], lowest)
-        self.marks[first:last] = self.stirred[first:last] = 0
+        self._slots[first:last] = self._marks.store(blocks["marks"])
         self.count = last
         enter(self.xyz, np.arange(first, last), self._keys, self._rows)
 
@@ -139,6 +149,7 @@ class BlockStore:
         gaps = rows[rows < kept]
         movers = np.setdiff1d(np.arange(kept, self.count), rows, assume_unique=True)
         leave(self.xyz, rows, self._keys, self._rows)
+        self._marks.release(self._slots[rows])
         for name in _PER_ROW:
             array = getattr(self, name)
             array[gaps] = array[movers]
@@ -150,7 +161,7 @@ class BlockStore:
     def _blank(self, first: int, last: int) -> None:
         """Make rows those of unknown blocks; `xyz` is the caller's matter."""
         self.log_odds[first:last] = UNKNOWN
-        for array in (self._settled, self.changed_at, self.seen_ns, self.held, self.marks, self.stirred):
+        for array in (self._settled, self.changed_at, self.seen_ns, self.held, self.stirred, self._slots):
             array[first:last] = 0
 
     def _reserve(self, count: int) -> None:

@@ -12,6 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.mapping.cell_coder import decode, encode
+from companion.mapping.marks import KINDS, QUIET, STILL
+from companion.mapping.rays import WORDS
 
 i64 = np.int64
 SHAPE = np.array([8, 8, 4])  # blocks of a region
@@ -20,7 +22,8 @@ _X, _Y, _Z = 3, 3, 2  # shifts from a block's position to its region's
 _SHIFT = np.array([_X, _Y, _Z])
 _HALF_RANGE = 1 << 20  # regions either way
 _AXIS = (1 << 21) - 1
-_OVERHEAD = 400  # bytes of the objects around the bytes
+_OVERHEAD = 520  # bytes of the objects around the bytes, and of the tables that name them
+_REST = (("changed_at", "<i8"), ("seen_ns", "<i8"), ("held", "|u1"), ("stirred", "|u1"))
 Blocks = dict[str, NDArray[Any]]  # as `BlockStore.take` gives them
 
 
@@ -30,59 +33,98 @@ class ColdRegion:
 
     count: int
     changes: tuple[int, int]  # smallest and largest `changed_at` inside
+    seen_ns: tuple[int, int]  # and `seen_ns`
     held: bool  # a block of a loaded map is inside
     places: bytes  # a bit for each of the PLACES
-    log_odds: bytes
-    rest: bytes  # the other arrays, in `layout`
-    layout: tuple[tuple[str, str], ...]  # name and kind of each
+    sizes: tuple[int, int]  # bytes of the log-odds, of the rest; what follows are the marks
+    size: int  # of all of them
+    data: bytes  # empty: they lie on a shelf
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of memory, estimated: the bytes and the objects around them."""
-        return len(self.places) + len(self.log_odds) + len(self.rest) + _OVERHEAD
+        """Bytes of memory, estimated, as if nothing lay on a shelf: the bytes and the objects around them."""
+        return len(self.places) + self.size + _OVERHEAD
 
 
 def pack(blocks: Mapping[str, NDArray[Any]]) -> ColdRegion:
     """Compress blocks of one region, in order of their places."""
     there = np.zeros(PLACES, np.uint8)
     there[places_of(blocks["xyz"])] = 1
-    rest = {name: array for name, array in blocks.items() if name not in ("xyz", "log_odds")}
     # Bytes of equal weight side by side: most of a stamp is the same all over the region.
-    planes = [array.view(np.uint8).reshape(len(array), -1).T.tobytes() for array in rest.values()]
+    planes = [blocks[name].view(np.uint8).reshape(len(blocks[name]), -1).T.tobytes() for name, _ in _REST]
+    log_odds = encode(places_of(blocks["xyz"]), blocks["log_odds"])
+    rest = zlib.compress(b"".join(planes), 1)
+    data = b"".join([log_odds, rest, _packed_marks(blocks)])
     return ColdRegion(
         count=len(blocks["xyz"]),
         changes=(int(blocks["changed_at"].min()), int(blocks["changed_at"].max())),
+        seen_ns=(int(blocks["seen_ns"].min()), int(blocks["seen_ns"].max())),
         held=bool(blocks["held"].any()),
         places=np.packbits(there).tobytes(),
-        log_odds=encode(places_of(blocks["xyz"]), blocks["log_odds"]),
-        rest=zlib.compress(b"".join(planes), 1),
-        layout=tuple((name, array.dtype.str) for name, array in rest.items()),
+        sizes=(len(log_odds), len(rest)),
+        size=len(data),
+        data=data,
     )
 
 
 def unpack(region: ColdRegion, key: int) -> Blocks:
     """The blocks that `pack` was given; `key` is the region's."""
     xyz = xyz_of(region, key)
-    blocks: Blocks = {"xyz": xyz, "log_odds": decode(region.log_odds, places_of(xyz))}
-    return blocks | unpack_rest(region)
+    blocks: Blocks = {"xyz": xyz, "log_odds": decode(region.data[: region.sizes[0]], places_of(xyz))}
+    blocks |= unpack_rest(region)
+    blocks["marks"] = _marks(region.data[sum(region.sizes) :], blocks["log_odds"])
+    return blocks
 
 
 def xyz_of(region: ColdRegion, key: int) -> NDArray[np.int32]:
     """Positions (N, 3) of its blocks."""
-    xyz = _corner(key) + _PLACE_XYZ[np.unpackbits(np.frombuffer(region.places, np.uint8)) != 0]
-    return np.asarray(xyz, np.int32)
+    return blocks_at(region.places, key)
+
+
+def blocks_at(places: bytes, key: int) -> NDArray[np.int32]:
+    """Positions (N, 3) of blocks, by the bits of their places in the region."""
+    return np.asarray(_corner(key) + _PLACE_XYZ[np.unpackbits(np.frombuffer(places, np.uint8)) != 0], np.int32)
 
 
 def unpack_rest(region: ColdRegion) -> Blocks:
-    """All arrays but those of positions and log-odds."""
-    data, first = np.frombuffer(zlib.decompress(region.rest), np.uint8), 0
+    """The arrays of one number per block."""
+    first, last = region.sizes[0], sum(region.sizes)
+    data, first = np.frombuffer(zlib.decompress(region.data[first:last]), np.uint8), 0
     blocks: Blocks = {}
-    for name, kind in region.layout:
+    for name, kind in _REST:
         size = np.dtype(kind).itemsize
         planes = data[first : first + size * region.count].reshape(size, region.count)
         blocks[name] = np.ascontiguousarray(planes.T).view(kind).reshape(region.count)
         first += size * region.count
     return blocks
+
+
+def _packed_marks(blocks: Mapping[str, NDArray[Any]]) -> bytes:
+    """Marks of the blocks that have some; where nothing happens, all that is occupied is quiet and still."""
+    marks: NDArray[np.uint64] = blocks["marks"]
+    some = np.flatnonzero(marks.any(axis=(1, 2)))
+    if len(some) == 0:
+        return b""
+    odd = marks[some]
+    odd[:, [QUIET, STILL]] ^= _occupied(blocks["log_odds"][some])[:, None]
+    bits = np.zeros(len(marks), np.uint8)
+    bits[some] = 1
+    return zlib.compress(np.packbits(bits).tobytes() + odd.transpose(1, 0, 2).tobytes(), 1)
+
+
+def _marks(data: bytes, log_odds: NDArray[np.int8]) -> NDArray[np.uint64]:
+    marks = np.zeros((len(log_odds), len(KINDS), WORDS), np.uint64)
+    if data:
+        plain, size = zlib.decompress(data), -(-len(marks) // 8)
+        some = np.flatnonzero(np.unpackbits(np.frombuffer(plain[:size], np.uint8)))
+        odd = np.frombuffer(plain[size:], np.uint64).reshape(len(KINDS), len(some), WORDS).transpose(1, 0, 2).copy()
+        odd[:, [QUIET, STILL]] ^= _occupied(log_odds[some])[:, None]
+        marks[some] = odd
+    return marks
+
+
+def _occupied(log_odds: NDArray[np.int8]) -> NDArray[np.uint64]:
+    return np.packbits(log_odds >= 0, axis=1, bitorder="little").view(np.uint64)
 
 
 def regions_of(block_xyz: NDArray[Any]) -> NDArray[np.int64]:

@@ -24,8 +24,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from companion.mapping.blocks import BlockStore
-from companion.mapping.fold import CAME, FRESH, MISSED, PROVEN, QUIET, STILL
+from companion.core.errors import InputError
+from companion.mapping.marks import CAME, FRESH, MISSED, PROVEN, QUIET, STILL
 from companion.mapping.rays import CELLS, WORDS
 from companion.mapping.sensor_model import UNKNOWN
 from companion.mapping.voxel_map import VoxelMap
@@ -38,7 +38,7 @@ class DecayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     on: bool = True
     period_s: Annotated[float, msgspec.Meta(ge=0.1, le=10.0)] = 0.4  # between passes; three without a hit are stale
-    crowd: Annotated[int, msgspec.Meta(ge=1, le=512)] = 4  # stale cells in a block below which none decays
+    crowd: Annotated[int, msgspec.Meta(ge=1, le=512)] = 16  # stale cells in a block below which none decays
     forget_unseen_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0  # blocks no ray met for so long go; 0: they stay
     erase_loaded: bool = False  # whether a loaded map decays like any other
 
@@ -68,38 +68,45 @@ class Decay:
 def decay(voxels: VoxelMap, now_ns: int, config: DecayConfig, *, since_ns: int) -> NDArray[np.int32]:
     """One pass at `now_ns`; the last one was at `since_ns`.
 
-    Returns the positions (K, 3) of the blocks in which a cell changed its class.
+    Returns the positions (K, 3) of the blocks in which a cell changed its class. Raises InputError
+    when the map was not made for it.
     """
     blocks = voxels.blocks
+    if not blocks.marking:
+        raise InputError("it keeps no marks", field="voxels", valid="VoxelMap(config, decays=True)")
     rows = np.flatnonzero(blocks.stirred[: blocks.count])
     changed = np.zeros(len(rows), np.bool_)
     kept = blocks.held if not config.erase_loaded else np.zeros_like(blocks.held)
     _pass(rows, blocks.marks, (blocks.log_odds, kept), config.crowd, changed)
-    blocks.stirred[rows] -= 1
     rows = rows[changed]
     if config.forget_unseen_s > 0.0:
-        rows = np.concatenate([rows, _forget_unseen(blocks, kept, now_ns, since_ns, config, voxels.steps.lowest)])
+        rows = np.concatenate([rows, _forget_unseen(voxels, now_ns, since_ns, config)])
     return blocks.xyz[blocks.mark_changed(rows)] if len(rows) else np.empty((0, 3), np.int32)
 
 
-def _forget_unseen(
-    blocks: BlockStore, kept: NDArray[np.uint8], now_ns: int, since_ns: int, config: DecayConfig, lowest: int
-) -> NDArray[np.int64]:
-    """Make blocks unknown that have become old since the last pass; their rows."""
-    age_ns = round(1e9 * config.forget_unseen_s)
+def _forget_unseen(voxels: VoxelMap, now_ns: int, since_ns: int, config: DecayConfig) -> NDArray[np.int64]:
+    """Make blocks unknown, cold or not, that have become old since the last pass; their rows."""
+    blocks, age_ns = voxels.blocks, round(1e9 * config.forget_unseen_s)
+    voxels.memory.bring_back_seen(since_ns - age_ns + 1, now_ns - age_ns)
     seen_ns = blocks.seen_ns[: blocks.count]
-    old = (seen_ns <= now_ns - age_ns) & (seen_ns > since_ns - age_ns) & (kept[: blocks.count] == 0)
+    old = (seen_ns <= now_ns - age_ns) & (seen_ns > since_ns - age_ns)
+    if not config.erase_loaded:
+        old &= blocks.held[: blocks.count] == 0
     rows = np.flatnonzero(old)
-    blocks.write(rows, np.full((len(rows), CELLS), UNKNOWN, np.int8), lowest)
+    blocks.write(rows, np.full((len(rows), CELLS), UNKNOWN, np.int8), voxels.steps.lowest)
     return rows
 
 
 @njit(cache=True, nogil=True)
-def _pass(rows, all_marks, cells, crowd, changed):  # type: ignore[no-untyped-def]
-    log_odds, held = cells
+def _pass(rows, marked, cells, crowd, changed):  # type: ignore[no-untyped-def]
+    (_, slots, stirred, (bits, free, left)), (log_odds, held) = marked, cells
     gone, weak, occupied = np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64)
     for n in range(rows.size):
-        marks, levels, keep = all_marks[rows[n]], log_odds[rows[n]], held[rows[n]] != 0
+        stirred[rows[n]] -= 1
+        slot = slots[rows[n]]
+        if slot == 0:
+            continue
+        marks, levels, keep = bits[slot], log_odds[rows[n]], held[rows[n]] != 0
         octets = levels.view(np.uint64)
         newcomers, passed = 0, 0
         for w in range(WORDS):
@@ -110,11 +117,17 @@ def _pass(rows, all_marks, cells, crowd, changed):  # type: ignore[no-untyped-de
             gone[:] = u64(0)
         if passed < crowd or keep:
             weak[:] = u64(0)
+        left_over = u64(0)
         for w in range(WORDS):
             if gone[w] | weak[w] != u64(0):
                 _lower(levels, 64 * w, (gone[w], weak[w]), keep)
                 changed[n] |= gone[w] != u64(0)
             _turn(marks, w, occupied[w] & ~gone[w])
+            left_over |= occupied[w] & ~gone[w]
+        if left_over == u64(0):  # so there are no marks
+            free[left[0]] = slot
+            left[0] += 1
+            slots[rows[n]] = 0
 
 
 @njit(cache=True, nogil=True)

@@ -19,6 +19,7 @@ from companion.mapping.follow import FollowConfig, MapFollower
 from companion.mapping.free_volume import cells_around
 from companion.mapping.landmark_node import LandmarkConfig
 from companion.mapping.share import MapShare, ShareConfig, warm_share
+from companion.mapping.shelf import Shelf
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 
 _Metres = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
@@ -50,17 +51,19 @@ class MappingNode(Node):
 
     publishes = (LOCAL_MAP, MAP_STATUS, OCCUPIED, MAP_DELTA, MAP_FULL, WHY)
 
-    def __init__(self, config: MappingConfig, rig: Rig, *, hull_radius_m: float) -> None:
+    def __init__(self, config: MappingConfig, rig: Rig, *, hull_radius_m: float, shelf: Shelf | None = None) -> None:
+        """`shelf`: where blocks of the map may lie that are far away."""
         self.config = config
         self.rig = rig
         self.hull_radius_m = hull_radius_m  # a sphere that is free at each scan: the vehicle fills it
-        self.voxels = VoxelMap(config.voxels)
+        self.voxels = VoxelMap(config.voxels, decays=config.decay.on, shelf=shelf)
         self.scans = self.skipped_pose = self.skipped_stamp = 0
         self._field = DistanceField(config.field, resolution_m=config.voxels.resolution_m)
         self.follower = MapFollower(config.follow, self.voxels)
         self._decay = Decay(config.decay)
         self._share = MapShare(config.share)
         self._newest_ns = -1
+        self._refused = False
         self._compile()
 
     @on(REGISTERED)
@@ -87,6 +90,7 @@ class MappingNode(Node):
         )
         self._decay.after_scan(self.voxels, scan.stamp_ns)
         yield from self._follow(scan)
+        yield from self._tell_of_shelf(scan.stamp_ns)
         if self.scans % self.config.map_every == 0:
             yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
             yield MAP_STATUS(self._status(scan.stamp_ns))
@@ -103,6 +107,14 @@ class MappingNode(Node):
         if done:
             what = f"corrected the map: {done.moved} of {done.moved + done.stayed} stretches of the flight moved"
             yield WHY(Why(stamp_ns=scan.stamp_ns, node="mapping", what=what, because="past poses were corrected"))
+
+    def _tell_of_shelf(self, stamp_ns: int) -> Outputs:
+        """Once: that far blocks stay in memory after all."""
+        refusal = self.voxels.memory.cold.shelves.refusal
+        if refusal and not self._refused:
+            self._refused = True
+            what = "keeps far blocks of the map in memory"
+            yield WHY(Why(stamp_ns=stamp_ns, node="mapping", what=what, because=f"they cannot be written: {refusal}"))
 
     def _status(self, stamp_ns: int) -> MapStatus:
         voxels = self.voxels
@@ -127,7 +139,8 @@ class MappingNode(Node):
         """Run every kernel once on nothing, so that the first scan does not wait for compilers."""
         zero = np.zeros(3)
         self.voxels.insert(np.empty((0, 3), np.float32), R_odom_body=np.eye(3), p_odom=zero, origin_odom=zero)
-        decay(self.voxels, 0, self.config.decay, since_ns=0)
+        if self.config.decay.on:
+            decay(self.voxels, 0, self.config.decay, since_ns=0)
         self._field.around(self.voxels, zero, 0)
         warm_share(self.voxels)
         warm_correction(self.config.voxels)

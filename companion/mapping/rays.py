@@ -25,13 +25,16 @@ WORDS = CELLS // 64
 _CUT = FINE - FRACTION  # bits cut off where 32 must do
 _STRIDES = (BLOCK * BLOCK, BLOCK, 1)  # of x, y, z inside a block
 _INSIDE = 2  # blocks of slack around the farthest voxel
+ScanBits = tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.int32]]
+"""(free, hit, hit_of): block n of the scratch has the bits free[n] and hit[hit_of[n]], (8,) each."""
 
 
 class RayGrid:
     """Bits `free` (crossed by a ray) and `hit` (holds a return) of one scan, by scratch block.
 
     Scratch block (i, j, k) is map block `corner + (i, j, k)`; its number is (i * side + j) *
-    side + k. Each hit bit has its free bit set, too. The consumer clears what it read.
+    side + k. Each hit bit has its free bit set, too. The consumer clears what it read, and then
+    says so to `cleared`.
     """
 
     def __init__(self, resolution_m: float, range_m: float) -> None:
@@ -40,7 +43,9 @@ class RayGrid:
         self.side = 2 * self.reach
         count = self.side**3
         self.free = np.zeros(count * WORDS, np.uint64)
-        self.hit = np.zeros(count * WORDS, np.uint64)
+        self._hit = np.zeros((1, WORDS), np.uint64)  # few blocks are hit: row 0 is that of all others
+        self._hit_of = np.zeros(count, np.int32)
+        self._hit_count = np.zeros(1, np.int64)  # rows in use
         self.corner = np.zeros(3, np.int64)
         self._reached = np.zeros((2, 3), np.int64)  # lowest and highest cell of any bit
         self._row = np.zeros(TILE * 3 * BLOCK * self.side + LANES, np.uint32)
@@ -48,6 +53,20 @@ class RayGrid:
         blocks = np.array([self.side**2, self.side, 1]) * CELLS
         strides = np.array(_STRIDES)
         self._strides = np.stack([strides, blocks - BLOCK * strides])  # index = x * [0] + (x >> 3) * [1]
+
+    @property
+    def bits(self) -> ScanBits:
+        """What the scan left: (free, hit, hit_of)."""
+        return self.free.reshape(-1, WORDS), self._hit, self._hit_of
+
+    @property
+    def hit_blocks(self) -> int:
+        """How many blocks hold a return."""
+        return int(self._hit_count[0])
+
+    def cleared(self) -> None:
+        """All bits, and `hit_of` of all blocks, are 0 again."""
+        self._hit_count[0] = 0
 
     def place(self, origin_odom: Array) -> None:
         """Centre the empty grid on the block of the sensor position (3,), m."""
@@ -69,7 +88,9 @@ class RayGrid:
         near_m, far_m, miss = ranges
         scale = 1.0 / self.resolution_m
         start = origin * scale - BLOCK * self.corner
-        bits = (self.free.view(np.uint8), self.hit.view(np.uint8), self._reached)
+        if not miss:
+            self._make_room(len(vectors))
+        bits = (self.free.view(np.uint8), (self._hit, self._hit_of, self._hit_count), self._reached)
         pose = (np.ascontiguousarray(R * scale), offset * scale, start)
         used, steps = _cast(
             vectors.reshape(-1), pose, (near_m, far_m * scale, miss), bits, self._row, self._strides, self._lines
@@ -86,6 +107,14 @@ class RayGrid:
         if len(cell):
             self._reached[0] = np.minimum(self._reached[0], cell.min(axis=0))
             self._reached[1] = np.maximum(self._reached[1], cell.max(axis=0))
+
+    def _make_room(self, returns: int) -> None:
+        """Rows for as many blocks as that many returns can hit; memory is taken only for those used."""
+        used, rows = self.hit_blocks + 1, self.hit_blocks + 1 + returns
+        if rows > len(self._hit):
+            more = np.zeros((2 * rows, WORDS), np.uint64)
+            more[:used] = self._hit[:used]
+            self._hit = more
 
     def met(self) -> NDArray[np.int64]:
         """Numbers of the scratch blocks with any bit, ascending."""
@@ -116,7 +145,7 @@ def _cast(vectors, pose, ranges, bits, row, strides, lines):  # type: ignore[no-
         for n in range(count):
             if whole[HITS + n] != 0:
                 index = _index(whole[LAST + n], whole[LAST + TILE + n], whole[LAST + 2 * TILE + n], strides)
-                _set_bit(hit, index)
+                _set_hit(hit, index)
                 _set_bit(free, index)
     if used > 0:
         _set_bit(free, _index(int(start[0]), int(start[1]), int(start[2]), strides))
@@ -185,6 +214,17 @@ def _index(x, y, z, strides):  # type: ignore[no-untyped-def]
 def _set_bit(bits, index):  # type: ignore[no-untyped-def]
     byte = index >> u64(3)
     bits[byte] = u8(bits[byte] | u8(u64(1) << (index & u64(7))))
+
+
+@njit(cache=True, nogil=True)
+def _set_hit(hit, index):  # type: ignore[no-untyped-def]
+    words, row_of, count = hit
+    block = index // u64(CELLS)
+    row = row_of[block]
+    if row == 0:
+        count[0] += 1
+        row = row_of[block] = count[0]
+    words[row, (index >> u64(6)) & u64(7)] |= u64(1) << (index & u64(63))
 
 
 @njit(cache=True, nogil=True)

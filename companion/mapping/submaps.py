@@ -21,11 +21,10 @@ from companion.mapping.cold_region import ColdRegion, keys_of, regions_of
 from companion.mapping.cold_region import pack as put_by
 from companion.mapping.evidence import Levels, PackedEvidence, added, evidence, pack, unpack
 from companion.mapping.pose_track import PoseTrack
-from companion.mapping.rays import CELLS, WORDS
+from companion.mapping.rays import CELLS, WORDS, ScanBits
 from companion.mapping.sensor_model import Steps
 from companion.mapping.voxel_map import VoxelMap
 
-Bits = tuple[NDArray[np.uint64], NDArray[np.uint64]]
 _GROWTH = 4096  # blocks
 
 
@@ -93,7 +92,7 @@ class Submaps:
         """No stretch waits to be packed."""
         return not self._closing
 
-    def watch(self, met: NDArray[np.int64], rows: NDArray[np.int64], bits: Bits) -> None:
+    def watch(self, met: NDArray[np.int64], rows: NDArray[np.int64], bits: ScanBits) -> None:
         """Note what a scan is about to change; the argument `watch` of `VoxelMap.insert`."""
         blocks = self.voxels.blocks
         xyz = blocks.xyz[rows]
@@ -194,8 +193,10 @@ def _joined(a: Submap, b: Submap, steps: Steps) -> Submap:
 
 @njit(cache=True, nogil=True)
 def _note(met, own, bits, noted):  # type: ignore[no-untyped-def]
-    crossed, hit = noted
+    (crossed, hit), (free, hits, hit_of) = noted, bits
     for m in range(met.size):
+        struck = hit_of[met[m]]
         for w in range(WORDS):
-            crossed[own[m], w] |= bits[0][met[m], w]
-            hit[own[m], w] |= bits[1][met[m], w]
+            crossed[own[m], w] |= free[met[m], w]
+            if struck != 0:
+                hit[own[m], w] |= hits[struck, w]

@@ -18,6 +18,7 @@ from companion.mapping.cold_region import Blocks
 from companion.mapping.memory import Memory, MemoryConfig
 from companion.mapping.rays import BLOCK, CELLS, RayGrid
 from companion.mapping.sensor_model import UNKNOWN, SensorModel, quantise
+from companion.mapping.shelf import Shelf
 
 UNKNOWN_CELL, FREE_CELL, OCCUPIED_CELL = 0, 1, 2  # as in core.messages.LocalMap.state
 _FARTHEST_M = 1e5  # where a float32 still tells centimetres, and far inside the hash's range
@@ -71,11 +72,13 @@ class VoxelMap:
     >>> voxels.classify(points + p)  # 0 unknown, 1 free, 2 occupied
     """
 
-    def __init__(self, config: VoxelMapConfig) -> None:
+    def __init__(self, config: VoxelMapConfig, *, decays: bool = False, shelf: Shelf | None = None) -> None:
+        """`decays`: `companion.mapping.decay` is called after every scan; `shelf`: where far blocks may lie."""
         self.config = config
         self.resolution_m = config.resolution_m
         self.steps = quantise(config.sensor)
-        self.blocks = BlockStore()  # for the other files of this package
+        self.shelf = shelf
+        self.blocks = BlockStore(marking=decays)  # for the other files of this package
         self.memory = _memory(self)  # far blocks, compressed: `blocks` holds the rest
         self._grid = RayGrid(config.resolution_m, config.max_range_m)
 
@@ -141,12 +144,13 @@ class VoxelMap:
     def blank(self) -> VoxelMap:
         """An empty map of the same kind, which shares the scratch of insertion."""
         other = copy(self)
-        other.blocks = BlockStore()
+        other.blocks = BlockStore(marking=self.blocks.marking)
         other.memory = _memory(other)
         return other
 
     def replace(self, other: VoxelMap) -> None:
         """Become what `other`, made by `blank`, is; that must not be used any more."""
+        self.memory.clear()
         self.blocks, self.memory = other.blocks, other.memory
 
     def query(self, points_odom: Array) -> Array32:
@@ -181,7 +185,9 @@ class VoxelMap:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any], config: VoxelMapConfig) -> VoxelMap:
+    def from_arrays(
+        cls, arrays: Mapping[str, Any], config: VoxelMapConfig, *, decays: bool = False, shelf: Shelf | None = None
+    ) -> VoxelMap:
         """A map from `to_arrays`; InputError when it does not fit `config` or is damaged."""
         model = config.sensor
         _check_same(arrays, "resolution_m", np.array(config.resolution_m))
@@ -191,7 +197,7 @@ class VoxelMap:
             raise InputError(f"shapes {xyz.shape}, {log_odds.shape} {log_odds.dtype} are no map", field="log_odds")
         if len(np.unique(xyz, axis=0)) != len(xyz):
             raise InputError("a block is there twice", field="block_xyz")
-        voxels = cls(config)
+        voxels = cls(config, decays=decays, shelf=shelf)
         voxels.blocks.add(xyz, log_odds, voxels.steps.lowest, held=True)
         return voxels
 
@@ -212,7 +218,13 @@ class VoxelMap:
 def _memory(voxels: VoxelMap) -> Memory:
     """What puts blocks of the map away."""
     config = voxels.config
-    return Memory(config.memory, voxels.blocks, resolution_m=config.resolution_m, lowest=voxels.steps.lowest)
+    return Memory(
+        config.memory,
+        voxels.blocks,
+        resolution_m=config.resolution_m,
+        lowest=voxels.steps.lowest,
+        shelf=voxels.shelf,
+    )
 
 
 def _rows(vectors: Array32) -> Array32:

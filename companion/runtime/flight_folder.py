@@ -11,6 +11,7 @@ from companion.config import Config, apply_overrides, load_config
 from companion.core.errors import InputError
 from companion.core.node import Node
 from companion.mission.model import parse_mission
+from companion.runtime.file_shelf import FileShelf
 from companion.runtime.log_file import VERSION, Header, entries
 from companion.stack import NODES, build
 
@@ -47,7 +48,7 @@ def rebuild(header: Header, overrides: Sequence[str] = (), *, signing_key: bytes
     mission = parse_mission(header.mission, file="mission of the log")
     keyless = header.signed and signing_key is None
     kinds = [kind for kind in kinds_of(header) if not (keyless and kind is AutopilotNode)]
-    return build(config, mission, seed=header.seed, only=kinds, signing_key=signing_key)
+    return build(config, mission, seed=header.seed, only=kinds, signing_key=signing_key, shelf=FileShelf())
 
 
 def kinds_of(header: Header) -> list[type[Node]]:

@@ -31,6 +31,7 @@ from companion.runtime.bus.graph import Graph
 from companion.runtime.bus.scene import SceneOutlet
 from companion.runtime.bus.session import open_session
 from companion.runtime.clock import Clock
+from companion.runtime.file_shelf import FileShelf
 from companion.runtime.inbox import InboxLog, inbox_path
 from companion.runtime.latency import HearingLog, Latency
 from companion.runtime.live import InboxLog as Log
@@ -112,7 +113,7 @@ class Process:
         self._config = config
         key = load_key(Path(a.key_file)) if a.key_file else None
         mission = parse_mission(a.mission, file="mission.yaml")
-        nodes = build(config, mission, seed=a.seed, only=GROUPS[a.group], signing_key=key)
+        nodes = build(config, mission, seed=a.seed, only=GROUPS[a.group], signing_key=key, shelf=FileShelf())
         warm(config, nodes)
         return nodes
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from companion.core.errors import InputError
 from companion.core.rig import Rig
 from companion.mapping.decay import Decay, DecayConfig, decay
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
@@ -22,7 +23,7 @@ class Mapper:
     """Scans at 10 Hz from the origin, with decay."""
 
     def __init__(self, config=None, voxels=None):
-        self.voxels = voxels or VoxelMap(MAP)
+        self.voxels = voxels or VoxelMap(MAP, decays=True)
         self.decay, self.now_ns = Decay(config or DecayConfig()), 0
 
     def see(self, points, times=1):
@@ -89,7 +90,7 @@ def test_few_cells_do_not_decay_and_many_do():
 def test_a_loaded_map_loses_newcomers_only():
     made = Mapper(DecayConfig(on=False)).see(WALL, 40).voxels
     made.blocks.held[: made.blocks.count] = 1
-    m = Mapper(voxels=VoxelMap.from_arrays(made.to_arrays(), MAP))
+    m = Mapper(voxels=VoxelMap.from_arrays(made.to_arrays(), MAP, decays=True))
     assert np.all(m.voxels.blocks.held[: m.voxels.blocks.count] == 1)
     m.see(FRONT, 8)
     assert m.classes(FRONT) == [2]
@@ -119,19 +120,26 @@ def test_a_pass_names_the_blocks_that_changed_and_no_others():
     assert {tuple(b) for b in m.voxels.changed_since(version).tolist()} == named
 
 
-def test_blocks_that_move_keep_their_marks_and_returned_ones_have_none():
+def test_a_map_without_marks_is_refused():
+    with pytest.raises(InputError, match="decays=True"):
+        decay(VoxelMap(MAP), 0, DecayConfig(), since_ns=0)
+
+
+def test_blocks_that_move_or_return_keep_their_marks():
     m = Mapper(DecayConfig(on=False)).see(WALL, 12).see(FRONT, 8)
     blocks = m.voxels.blocks
     row = blocks.rows_of(np.floor(FRONT[:1] / 1.6).astype(np.int64))
-    before = blocks.marks[row].copy()
-    assert before.any()
-    place = blocks.xyz[row].astype(np.int64)
-    first = np.setdiff1d(np.arange(3), row)
+    before = blocks.take(row)
+    assert before["marks"].any()
+    first = np.append(np.setdiff1d(np.arange(3), row), blocks.rows_of(np.floor(WALL[:1] / 1.6).astype(np.int64)))
     kept = blocks.take(first)
+    assert kept["marks"].any()
     blocks.remove(first)
-    np.testing.assert_array_equal(blocks.marks[blocks.rows_of(place)], before)
     blocks.put(kept, m.voxels.steps.lowest)
-    assert not blocks.marks[blocks.count - len(first) : blocks.count].any()
+    for wanted in (before, kept):
+        again = blocks.take(blocks.rows_of(wanted["xyz"].astype(np.int64)))
+        for name, array in wanted.items():
+            np.testing.assert_array_equal(again[name], array, err_msg=name)
 
 
 def test_ghosts_of_a_rendered_walker_are_gone_within_two_seconds():
@@ -149,7 +157,7 @@ def test_ghosts_of_a_rendered_walker_are_gone_within_two_seconds():
 
 def ghost_lives(world, *, on):
     """How long cells stay occupied after the walker has left them, s, in 15 s of scans."""
-    rig, voxels, decay_ = Rig(), VoxelMap(VoxelMapConfig(max_range_m=15.0)), Decay(DecayConfig(on=on))
+    rig, voxels, decay_ = Rig(), VoxelMap(VoxelMapConfig(max_range_m=15.0), decays=True), Decay(DecayConfig(on=on))
     lidar = Lidar(LidarConfig(), rig.lidar, Caster(world.mesh), world.mesh, 0, walkers=world.walkers)
     R, p = rig.lidar.R_body_sensor, np.array([0.0, 0.0, 2.0])
     poses = np.tile(p, (2, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))

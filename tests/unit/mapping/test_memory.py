@@ -20,9 +20,11 @@ from companion.mapping.cold_region import (
     regions_of,
     unpack,
 )
-from companion.mapping.deltas import FullWalk, states_of
+from companion.mapping.decay import Decay, DecayConfig
+from companion.mapping.deltas import FullWalk, delta_since, records_of, states_of
 from companion.mapping.deltas import unpack as records_from
 from companion.mapping.memory import MemoryConfig
+from companion.mapping.mirror import MapMirror
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 
 NEVER = MemoryConfig(keep_m=1e5)
@@ -31,10 +33,11 @@ BIG = 10**9
 SLAB_MB = 1e-6 * BlockStore().memory_bytes  # the least that a store takes
 
 
-def make(memory, resolution_m=0.2, range_m=6.0):
-    return VoxelMap(
-        VoxelMapConfig(resolution_m=resolution_m, max_range_m=range_m, miss_clear_range_m=range_m / 2, memory=memory)
+def make(memory, resolution_m=0.2, range_m=6.0, decays=False, shelf=None):
+    config = VoxelMapConfig(
+        resolution_m=resolution_m, max_range_m=range_m, miss_clear_range_m=range_m / 2, memory=memory
     )
+    return VoxelMap(config, decays=decays, shelf=shelf)
 
 
 def look(voxels, at, seed, returns=60):
@@ -79,6 +82,8 @@ def random_region(rng, count, corner):
         "changed_at": rng.integers(0, 2**62, count),
         "seen_ns": rng.integers(-(2**62), 2**62, count),
         "held": rng.integers(0, 2, count).astype(np.uint8),
+        "stirred": rng.integers(0, 5, count).astype(np.uint8),
+        "marks": (rng.integers(0, 2**63, (count, 6, 8)) * rng.integers(0, 2, (count, 1, 1))).astype(np.uint64),
     }
 
 
@@ -154,8 +159,120 @@ def test_over_random_walks_the_map_is_the_one_without_eviction(walk, seed, few, 
     assert np.array_equal(plain.occupied_centers(), lean.occupied_centers())
 
 
-def there_and_back(memory, length_m=60.0, step_m=1.0):
-    voxels = make(memory)
+@given(steps, st.integers(0, 1000), st.sampled_from([0.0, 3.0, 8.0]), st.sampled_from([0.0, 1.5]))
+@settings(max_examples=40, deadline=None)
+def test_with_decay_the_map_is_the_one_without_eviction(walk, seed, keep_m, forget_unseen_s):
+    """Marks go and come with the blocks: the same cells decay, now and long after a return."""
+    config = DecayConfig(period_s=0.2, crowd=1, forget_unseen_s=forget_unseen_s)
+    pair = [make(NEVER, decays=True), make(MemoryConfig(keep_m=keep_m, regions_per_scan=9), decays=True)]
+    passes = [Decay(config), Decay(config)]
+    at, rng = np.zeros(3), np.random.default_rng(seed)
+    for n, step in enumerate([*walk, *[(0, 0, 0)] * 6, *[tuple(-b for b in back) for back in walk[::-1]]]):
+        at = at + 0.5 * np.array(step)
+        stamp_ns, points = n * 10**8, rng.normal(size=(80, 3)) * 2.0
+        forgotten = []
+        for voxels, one in zip(pair, passes, strict=True):
+            voxels.insert(
+                points.astype(np.float32), R_odom_body=np.eye(3), p_odom=at, origin_odom=at, stamp_ns=stamp_ns
+            )
+            forgotten.append(one.after_scan(voxels, stamp_ns))
+        assert len(forgotten[0]) == len(forgotten[1])
+    assert_same(*pair)
+    assert pair[0].version == pair[1].version
+
+
+def test_only_blocks_in_which_something_stands_have_marks():
+    voxels, passes = make(NEVER, decays=True), Decay(DecayConfig())
+    for n in range(60):
+        look(voxels, (0.2 * n, 0.0, 1.0), n)
+        passes.after_scan(voxels, n * 10**8)
+    for n in range(60, 120):  # from afar: all passes are made
+        look(voxels, (60.0, 0.0, 1.0), 5, returns=0)
+        passes.after_scan(voxels, n * 10**8)
+    parts = whole(voxels)
+    occupied = np.any(parts["log_odds"] >= 0, axis=1)
+    assert np.array_equal(occupied, np.any(parts["marks"], axis=(1, 2)))
+    assert 0 < np.count_nonzero(occupied) < len(occupied)
+    assert not parts["stirred"].any()
+    slots = voxels.blocks._slots[: voxels.blocks.count]
+    table = voxels.blocks._marks
+    assert len(np.unique(slots[slots > 0])) == np.count_nonzero(occupied)
+    free = table.free[: table.left[0]]
+    assert np.array_equal(np.sort(np.concatenate([free, slots[slots > 0]])), np.arange(1, len(table.bits)))
+    assert not table.bits[free].any()
+
+
+class Failing:
+    """A shelf that takes `room` bytes, then refuses, and from get number `breaks` on cannot read."""
+
+    def __init__(self, room=10**9, breaks=10**9):
+        self.room, self.breaks, self.kept, self.gets = room, breaks, {}, 0
+
+    def put(self, data):
+        if len(data) > self.room:
+            raise OSError(28, "No space left on device")
+        self.room -= len(data)
+        self.kept[len(self.kept)] = data
+        return len(self.kept) - 1
+
+    def get(self, number):
+        self.gets += 1
+        if self.gets > self.breaks:
+            raise OSError(5, "Input/output error")
+        return self.kept[number]
+
+    def drop(self, number):
+        self.kept[number] = None
+
+
+@pytest.mark.parametrize("room", [0, 20_000, 10**9])
+def test_a_shelf_changes_nothing_of_the_map_even_when_it_is_full(room):
+    shelf = Failing(room)
+    plain, lean = there_and_back(EAGER), there_and_back(EAGER, shelf=shelf)
+    assert digest(plain) == digest(lean)
+    assert lean.memory_bytes == plain.memory_bytes
+    shelves = lean.memory.cold.shelves
+    assert (shelves.refusal is None) == (room == 10**9)
+    assert (len(shelf.kept) > 0) == (room > 0)
+    assert shelves.outside_bytes + shelves.inside_bytes == plain.memory.cold.shelves.inside_bytes
+    lean.memory.clear()
+    assert shelves.outside_bytes == shelves.inside_bytes == lean.memory.memory_bytes == 0
+
+
+def test_without_spill_nothing_goes_on_a_shelf():
+    shelf = Failing()
+    lean = there_and_back(MemoryConfig(keep_m=0.0, regions_per_scan=4, spill=False), shelf=shelf)
+    assert not shelf.kept
+    assert lean.memory.cold_regions > 0 == lean.memory.spilled_bytes
+
+
+def test_what_cannot_be_read_again_is_forgotten_counted_and_told():
+    plain, lean = there_and_back(NEVER), there_and_back(EAGER, shelf=Failing(breaks=30))
+    wanted, parts = whole(plain), whole(lean)
+    lost = lean.memory.cold.lost_blocks
+    assert 0 < lost == lean.memory.forgotten_blocks
+    kept = {tuple(p): n for n, p in enumerate(wanted["xyz"].tolist())}
+    assert {tuple(p) for p in parts["xyz"].tolist()} <= kept.keys()
+    assert len(parts["xyz"]) >= len(kept) - lost
+    left = {tuple(p) for p in lean.changed_since(-1).tolist()}
+    assert left == kept.keys()
+
+
+def test_mirrors_forget_what_the_budget_made_the_map_forget():
+    lean, mirror = make(MemoryConfig(keep_m=6.0, budget_mb=SLAB_MB + 0.4), 0.1), MapMirror()
+    for n in range(300):
+        look(lean, (n, 0.0, 1.0), n, returns=30)
+        delta = delta_since(lean, mirror.version, stamp_ns=n, map_ns=0)
+        assert delta is None or mirror.take(delta)
+    assert lean.memory.forgotten_blocks > 100
+    records = records_of(lean, np.concatenate([part["xyz"] for part in lean.memory.parts()]))
+    have = mirror.voxels.memory.parts()
+    known = {tuple(x) for part in have for x in part["xyz"][np.any(part["log_odds"] != -128, axis=1)].tolist()}
+    assert known == {tuple(r["xyz"].tolist()) for r in records if r["states"].any()}
+
+
+def there_and_back(memory, length_m=60.0, step_m=1.0, shelf=None):
+    voxels = make(memory, shelf=shelf)
     way = np.arange(0.0, length_m, step_m)
     for n, x in enumerate(np.concatenate([way, way[::-1]])):
         look(voxels, (x, 0.3 * np.sin(x), 1.0), n)
@@ -182,7 +299,7 @@ def test_no_cold_region_is_ever_within_reach_even_after_a_jump():
         look(lean, at, n)
         lean.window(np.floor(at / 1.6).astype(np.int64) - 2, np.empty((32, 32, 32), np.uint8))
         edge = np.array([12.8, 12.8, 6.4])
-        low = positions_of(np.array(list(lean.memory._cold), np.int64)) * edge
+        low = positions_of(np.array(list(lean.memory.cold.regions), np.int64)) * edge
         gap = np.maximum(np.maximum(low - at, at - low - edge), 0.0)
         assert len(gap) == 0 or np.linalg.norm(gap, axis=1).min() > reach
     assert lean.memory.cold_regions > 20
@@ -195,7 +312,7 @@ def test_each_scan_moves_at_most_so_many_regions(few):
     before, most = set(), 0
     for n, x in enumerate(way):
         look(lean, (x, 0.0, 0.0), n)
-        cold = set(lean.memory._cold)
+        cold = set(lean.memory.cold.regions)
         assert len(cold - before) <= few
         most = max(most, len(before - cold))
         before = cold
@@ -259,8 +376,8 @@ def test_blocks_of_a_loaded_map_stay_so_when_they_were_away():
 def test_blocks_added_to_a_cold_region_join_it():
     lean = there_and_back(EAGER)
     lean.memory.bring_back((np.zeros(3, np.int64), np.zeros(3, np.int64)))
-    count, key = lean.block_count, next(iter(lean.memory._cold))
-    taken = {tuple(p) for p in unpack(lean.memory._cold[key], key)["xyz"].tolist()}
+    count, key = lean.block_count, next(iter(lean.memory.cold.regions))
+    taken = {tuple(p) for p in lean.memory.cold.read(key)["xyz"].tolist()}
     place = next(p for p in all_blocks(key).tolist() if tuple(p) not in taken)
     lean.blocks.add(np.array([place], np.int32), np.full((1, 512), 5, np.int8), lean.steps.lowest, False)
     assert lean.block_count == count + 1
@@ -268,7 +385,7 @@ def test_blocks_added_to_a_cold_region_join_it():
     for _ in range(3):
         lean.memory.before_scan(np.zeros(3, np.int64), 1)
     assert digest(lean) == before
-    assert lean.memory._cold[key].count == len(taken) + 1
+    assert lean.memory.cold.regions[key].count == len(taken) + 1
 
 
 def walk_far(memory, scans=300, step_m=1.0):
@@ -291,7 +408,8 @@ def test_memory_is_bounded_over_a_long_walk_and_what_was_forgotten_is_counted():
     wanted = whole(plain)
     kept = np.isin(keys_of(wanted["xyz"].astype(np.int64)), known)
     for name, array in whole(lean).items():
-        assert np.array_equal(array, wanted[name][kept]), name  # all that is kept is right
+        if name != "changed_at":  # forgetting takes versions
+            assert np.array_equal(array, wanted[name][kept]), name  # all that is kept is right
     start, end, middle = (np.count_nonzero(np.abs(wanted["xyz"][kept, 0] - b) < 20) for b in (0, 374, 187))
     assert start > 0
     assert end > 0

@@ -10,7 +10,7 @@ import pytest
 from companion.core.geometry import quaternion_from_yaw
 from companion.core.messages import RegisteredScan, freeze
 from companion.core.rig import Rig
-from companion.core.topics import LOCAL_MAP, MAP_STATUS, REGISTERED
+from companion.core.topics import LOCAL_MAP, MAP_STATUS, REGISTERED, WHY
 from companion.mapping.distance_field import FieldConfig
 from companion.mapping.free_volume import cells_around
 from companion.mapping.memory import MemoryConfig
@@ -172,3 +172,20 @@ def test_the_status_tells_what_is_compressed_and_what_the_budget_cost():
     assert roomy.forgotten_blocks == 0
     assert tight.cold_blocks == 0
     assert tight.blocks + tight.forgotten_blocks == roomy.blocks
+
+
+class FullDisk:
+    def put(self, data):
+        raise OSError(28, "No space left on device")
+
+
+def test_a_disk_that_is_full_costs_memory_and_is_told_once():
+    near = msgspec.structs.replace(NEARBY.voxels, memory=MemoryConfig(keep_m=0.0))
+    config = msgspec.structs.replace(NEARBY, voxels=near)
+    node, whys = MappingNode(config, Rig(), hull_radius_m=0.35, shelf=FullDisk()), []
+    for k in range(30):
+        outputs = node.handle(REGISTERED, scan(10**8 * (k + 1), p=(2.0 * k, 0.0, 0.3)))
+        whys += [o.message for o in outputs if o.topic is WHY]
+    assert node.voxels.memory.cold_blocks > 0 == node.voxels.memory.spilled_bytes
+    assert [w.what for w in whys] == ["keeps far blocks of the map in memory"]
+    assert "No space left" in whys[0].because
