@@ -2,7 +2,8 @@
 
 figures = memory_figures(length_m=1000.0, resolution_m=0.1)
 
-Of the map alone: the local maps that a flight makes of it are messages, and take their own memory.
+Of the map alone, with decay and a shelf as in flight: the local maps that a flight makes of it are
+messages, and take their own memory, as does what corrections need.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.errors import CompanionError
+from companion.mapping.decay import Decay, DecayConfig
 from companion.mapping.memory import MemoryConfig
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 from companion.runtime.bench.mapping_kilometre import LongScan, fly_along, look_from, make_long_forest
+from companion.runtime.file_shelf import FileShelf
 
 STEP_M = 0.5  # between scans: 5 m/s at 10 Hz
 _SAMPLE_EVERY = 50  # scans per look at the memory
@@ -55,14 +58,16 @@ class Side(msgspec.Struct, frozen=True, kw_only=True):
     rss_growth_mb: float  # at the end of the way
     peak_growth_mb: float  # largest on the way, as sampled
     scratch_mb: float  # of it, insertion's ray grid
-    map_mb: float  # that the map says it has
+    map_mb: float  # that the map says it has in memory
+    spilled_mb: float  # and beside it in the temporary file
+    file_mb: float  # size of that, gaps included
     blocks: int
     warm_blocks: int
     cold_regions: int
-    compression: float  # bytes of the cold blocks' voxels per byte kept
+    compression: float  # bytes of the cold blocks' voxels per byte kept, in the file or in memory
     move_ms_p50: float  # CPU per scan, of bringing back and putting away
     move_ms_max: float
-    insert_ms_p50: float  # CPU per scan, moves included
+    insert_ms_p50: float  # CPU per scan, moves and decay included
     return_ms: float  # CPU of the scan back at the start: all that it needs at once
     forgotten_blocks: int
     digest: str  # of every bit of the map, back at the start
@@ -84,7 +89,7 @@ def memory_figures(*, length_m: float = 1000.0, resolution_m: float = 0.1, seed:
     figures = {name: value for name, value in msgspec.to_builtins(lean).items() if name != "digest"}
     chosen = ("rss_growth_mb", "peak_growth_mb", "map_mb", "insert_ms_p50")
     figures |= {f"plain_{name}": getattr(plain, name) for name in chosen}
-    return figures | {"identical": float(lean.digest == plain.digest), "length_m": length_m}
+    return figures | {"identical_on_return": float(lean.digest == plain.digest), "length_m": length_m}
 
 
 def _start(stack: ExitStack, task: _Task) -> subprocess.Popen[bytes]:
@@ -137,24 +142,28 @@ def main() -> None:
 def _measure(stream: IO[bytes], config: VoxelMapConfig) -> Side:
     _warm_up()
     before = rss_mb()
-    voxels = VoxelMap(config)
+    shelf = FileShelf()
+    voxels, decay = VoxelMap(config, decays=True, shelf=shelf), Decay(DecayConfig())
     watch = _Watch(voxels)
     insert_ms, grown = [], [0.0]
     for number, sent in enumerate(_scans(stream)):
-        insert_ms.append(_insert(voxels, sent))
+        insert_ms.append(_insert(voxels, decay, sent))
         if number % _SAMPLE_EVERY == 0:
             grown.append(rss_mb() - before)
     at_end, moves = rss_mb() - before, np.array(watch.moves_ms)
-    memory, map_mb = voxels.memory, voxels.memory_bytes * 1e-6
+    memory, spilled_mb = voxels.memory, voxels.memory.spilled_bytes * 1e-6
+    map_mb, file_mb = voxels.memory_bytes * 1e-6 - spilled_mb, shelf.file_bytes * 1e-6
     counts = (voxels.block_count, voxels.blocks.count, memory.cold_regions)
     cold_bytes = 512.0 * memory.cold_blocks
     compression = cold_bytes / max(memory.memory_bytes, 1)
-    return_ms = max(_insert(voxels, sent) for sent in _scans(stream))
+    return_ms = max(_insert(voxels, decay, sent) for sent in _scans(stream))
     return Side(
         rss_growth_mb=round(at_end, 1),
         peak_growth_mb=round(max(*grown, at_end), 1),
         scratch_mb=round(_drop_scratch(voxels), 1),
         map_mb=round(map_mb, 1),
+        spilled_mb=round(spilled_mb, 1),
+        file_mb=round(file_mb, 1),
         blocks=counts[0],
         warm_blocks=counts[1],
         cold_regions=counts[2],
@@ -182,12 +191,13 @@ class _Watch:
         self.moves_ms.append(1e3 * (time.process_time() - started))
 
 
-def _insert(voxels: VoxelMap, sent: _Sent) -> float:
+def _insert(voxels: VoxelMap, decay: Decay, sent: _Sent) -> float:
     """CPU ms of one scan."""
     R, p = np.frombuffer(sent.R).reshape(3, 3), np.frombuffer(sent.p)
     points, misses = (np.frombuffer(data, np.float32).reshape(-1, 3) for data in (sent.points, sent.misses))
     started = time.process_time()
     voxels.insert(points, R_odom_body=R, p_odom=p, origin_odom=p, miss_dirs_body=misses, stamp_ns=sent.stamp_ns)
+    decay.after_scan(voxels, sent.stamp_ns)
     return 1e3 * (time.process_time() - started)
 
 
@@ -195,13 +205,14 @@ def _warm_up() -> None:
     """Compile everything, and let go of it."""
     forest = make_long_forest(10.0, seed=0)
     config = VoxelMapConfig(max_range_m=6.0, miss_clear_range_m=6.0, memory=MemoryConfig(keep_m=0.0))
-    voxels = VoxelMap(config)
+    voxels, decay = VoxelMap(config, decays=True, shelf=FileShelf()), Decay(DecayConfig())
     for number in range(6):
         scan = look_from(forest, 8.0 * (number % 3), number)
         voxels.insert(
             scan.points_body, R_odom_body=scan.R_odom_body, p_odom=scan.p_odom, origin_odom=scan.p_odom,
             miss_dirs_body=scan.miss_dirs_body,
         )  # fmt: skip
+        decay.after_scan(voxels, number * 10**9)
     _digest(voxels)
 
 
