@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from companion.cli.bench_planners import cells
+from companion.planning.registry import PLANNERS
 from companion.runtime.bench.planners import PlannerRow
 from companion.runtime.bench.planners_exercise import Answer, comment, solve
 from companion.runtime.bench.planners_facts import FACTS
@@ -162,7 +163,9 @@ def main() -> None:
     """Write the page."""
     rows = msgspec.json.Decoder(PlannerRow).decode_lines(Path(sys.argv[1]).read_bytes())
     worlds = [world_block(w, [r for r in rows if r.world == w]) for w in dict.fromkeys(r.world for r in rows)]
-    facts = "\n".join(f"| `{n}` | {f.optimal} | {f.complete} | {f.effort} | {f.use} |" for n, f in FACTS.items())
+    facts = "\n".join(
+        f"| `{n}` | {f.optimal} | {f.complete} | {f.effort} | {f.use} |" for n, f in FACTS.items() if n in PLANNERS
+    )
     answers = solve()
     page = PAGE.format(
         facts=facts,

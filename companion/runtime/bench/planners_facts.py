@@ -58,6 +58,12 @@ FACTS = {
         "O(n log n)",
         "a first way, fast; what better planners begin with",
     ),
+    "portfolio": Facts(
+        "as n grows",
+        "at the cell size: its lattice proves that there is no way",
+        "RRT-Connect and a coarse-to-fine lattice first, then as RRT*",
+        "flight: a first way at once also in hard places, then as RRT*",
+    ),
     "rrt_star": Facts(
         "as n grows",
         "with probability 1 as n grows",
