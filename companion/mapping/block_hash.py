@@ -10,21 +10,39 @@ EMPTY = -1  # key of a slot that is not in use
 
 
 @njit(cache=True, nogil=True)
-def find_or_make(met, side, corner, table, count, rows):  # type: ignore[no-untyped-def]
-    """Find or make the block of each scratch block; returns the new number of blocks."""
+def find_scratch(met, grid, table, rows):  # type: ignore[no-untyped-def]
+    """Row of each scratch block of `grid` = (side, corner), -1: not there; returns how many are not."""
+    keys, values = table
+    missing = 0
+    for m in range(met.size):
+        x, y, z = _place(met[m], grid)
+        slot = slot_of(keys, x, y, z)
+        rows[m] = -1 if keys[slot] == EMPTY else values[slot]
+        missing += keys[slot] == EMPTY
+    return missing
+
+
+@njit(cache=True, nogil=True)
+def make_scratch(met, grid, table, count, rows):  # type: ignore[no-untyped-def]
+    """Make the blocks that were not there, in rows from `count` on."""
     keys, values, xyz = table
     for m in range(met.size):
-        i, rest = divmod(met[m], side * side)
-        j, k = divmod(rest, side)
-        x, y, z = i + corner[0], j + corner[1], k + corner[2]
-        slot = slot_of(keys, x, y, z)
-        if keys[slot] == EMPTY:
-            keys[slot] = key_of(x, y, z)
-            values[slot] = count
+        if rows[m] < 0:
+            x, y, z = _place(met[m], grid)
+            slot = slot_of(keys, x, y, z)
+            keys[slot], values[slot] = key_of(x, y, z), count
             xyz[count, 0], xyz[count, 1], xyz[count, 2] = x, y, z
+            rows[m] = count
             count += 1
-        rows[m] = values[slot]
-    return count
+
+
+@njit(cache=True, nogil=True)
+def _place(number, grid):  # type: ignore[no-untyped-def]
+    """Position of a scratch block."""
+    side, corner = grid
+    i, rest = divmod(number, side * side)
+    j, k = divmod(rest, side)
+    return i + corner[0], j + corner[1], k + corner[2]
 
 
 @njit(cache=True, nogil=True)

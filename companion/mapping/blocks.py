@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from companion.mapping.block_hash import EMPTY, enter, find, find_or_make, leave, slot_of
+from companion.mapping.block_hash import EMPTY, enter, find, find_scratch, leave, make_scratch, slot_of
 from companion.mapping.fold import fold_bits
 from companion.mapping.marks import MarkTable
 from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid, ScanBits
@@ -72,11 +72,7 @@ class BlockStore:
         changed between unknown, free and occupied.
         """
         met = grid.met()
-        self._reserve(self.count + len(met))
-        rows, before = np.empty(len(met), np.int64), self.count
-        table = (self._keys, self._rows, self.xyz)
-        self.count = int(find_or_make(met, grid.side, grid.corner, table, self.count, rows))
-        self._blank(before, self.count)
+        rows = self._make(met, grid)
         amounts = np.array([steps.hit, steps.miss, steps.lowest, steps.highest], np.int16)
         changed = np.zeros(len(met), np.uint8)
         if watch is not None:
@@ -87,6 +83,17 @@ class BlockStore:
         grid.cleared()
         self.seen_ns[rows] = stamp_ns
         return len(met), self.xyz[self.mark_changed(rows[changed != 0])]
+
+    def _make(self, met: NDArray[np.int64], grid: RayGrid) -> NDArray[np.int64]:
+        """Row (K,) of each scratch block; those that are not there are made."""
+        rows, place, first = np.empty(len(met), np.int64), (grid.side, grid.corner), self.count
+        missing = int(find_scratch(met, place, self.table, rows))
+        if missing:
+            self._reserve(first + missing)
+            make_scratch(met, place, (self._keys, self._rows, self.xyz), first, rows)
+            self._blank(first, first + missing)
+            self.count = first + missing
+        return rows
 
     def mark_changed(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """A new version, in which cells of the blocks in `rows` (K,) changed their class; returns `rows`."""
