@@ -27,6 +27,8 @@ _STRIDES = (BLOCK * BLOCK, BLOCK, 1)  # of x, y, z inside a block
 _INSIDE = 2  # blocks of slack around the farthest voxel
 ScanBits = tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.int32]]
 """(free, hit, hit_of): block n of the scratch has the bits free[n] and hit[hit_of[n]], (8,) each."""
+ToGrid = tuple[Array, Array, Array]
+"""(R, offset, start): the ray to a vector v begins at `start` and ends at start + R v + offset, in voxels."""
 
 
 class RayGrid:
@@ -45,7 +47,7 @@ class RayGrid:
         self.free = np.zeros(count * WORDS, np.uint64)
         self._hit = np.zeros((1, WORDS), np.uint64)  # few blocks are hit: row 0 is that of all others
         self._hit_of = np.zeros(count, np.int32)
-        self._hit_count = np.zeros(1, np.int64)  # rows in use
+        self.hit_count = np.zeros(1, np.int64)  # rows in use
         self.corner = np.zeros(3, np.int64)
         self._reached = np.zeros((2, 3), np.int64)  # lowest and highest cell of any bit
         self._row = np.zeros(TILE * 3 * BLOCK * self.side + LANES, np.uint32)
@@ -62,11 +64,11 @@ class RayGrid:
     @property
     def hit_blocks(self) -> int:
         """How many blocks hold a return."""
-        return int(self._hit_count[0])
+        return int(self.hit_count[0])
 
     def cleared(self) -> None:
         """All bits, and `hit_of` of all blocks, are 0 again."""
-        self._hit_count[0] = 0
+        self.hit_count[0] = 0
 
     def place(self, origin_odom: Array) -> None:
         """Centre the empty grid on the block of the sensor position (3,), m."""
@@ -74,28 +76,38 @@ class RayGrid:
         self.corner = block - self.reach
         self._reached[:] = np.floor(origin_odom / self.resolution_m).astype(np.int64) - BLOCK * self.corner
 
-    def cast(
-        self, vectors: Array32, to_odom: tuple[Array, Array, Array], ranges: tuple[float, float, bool]
-    ) -> tuple[int, int]:
-        """Rasterise rays from the sensor.
-
-        `vectors` (N, 3) float32 in body; `to_odom` = (R_odom_body, offset, origin) so that
-        the ray is R v + offset, from origin, m; `ranges` = (nearest length of v that counts,
-        farthest ray, all rays miss), m. Rays beyond the farthest are cut there and hit
-        nothing. Returns (rays used, voxel steps); rays that are not finite are not used.
-        """
-        R, offset, origin = to_odom
-        near_m, far_m, miss = ranges
+    def to_grid(self, R_odom_body: Array, offset_odom: Array, origin_odom: Array) -> ToGrid:
+        """For rays from the origin (3,) to origin + offset + R v, m."""
         scale = 1.0 / self.resolution_m
-        start = origin * scale - BLOCK * self.corner
+        start = origin_odom * scale - BLOCK * self.corner
+        return np.ascontiguousarray(R_odom_body * scale), offset_odom * scale, start
+
+    def cast(self, vectors: Array32, to_grid: ToGrid, ranges: tuple[float, float, bool]) -> tuple[int, int]:
+        """Rasterise rays from the sensor to `vectors` (N, 3) float32.
+
+        `ranges` = (nearest length of v that counts, farthest ray, m, all rays miss). Rays beyond the
+        farthest are cut there and hit nothing. Returns (rays used, voxel steps); rays that are not finite
+        are not used.
+        """
+        near, far_m, miss = ranges
         if not miss:
-            self._make_room(len(vectors))
-        bits = (self.free.view(np.uint8), (self._hit, self._hit_of, self._hit_count), self._reached)
-        pose = (np.ascontiguousarray(R * scale), offset * scale, start)
+            self.make_room(len(vectors))
+        bits = (self.free.view(np.uint8), (self._hit, self._hit_of, self.hit_count), self._reached)
         used, steps = _cast(
-            vectors.reshape(-1), pose, (near_m, far_m * scale, miss), bits, self._row, self._strides, self._lines
+            vectors.reshape(-1),
+            to_grid,
+            (near, far_m * (1.0 / self.resolution_m), miss),
+            bits,
+            self._row,
+            self._strides,
+            self._lines,
         )
         return int(used), int(steps)
+
+    def stretch(self, other: RayGrid) -> None:
+        """Count the cells that `other` has reached as reached."""
+        self._reached[0] = np.minimum(self._reached[0], other._reached[0])
+        self._reached[1] = np.maximum(self._reached[1], other._reached[1])
 
     def mark_free(self, points_odom: Array) -> None:
         """Set the free bit of the voxels that hold the points (K, 3), m; outside: ignored."""
@@ -108,7 +120,7 @@ class RayGrid:
             self._reached[0] = np.minimum(self._reached[0], cell.min(axis=0))
             self._reached[1] = np.maximum(self._reached[1], cell.max(axis=0))
 
-    def _make_room(self, returns: int) -> None:
+    def make_room(self, returns: int) -> None:
         """Rows for as many blocks as that many returns can hit; memory is taken only for those used."""
         used, rows = self.hit_blocks + 1, self.hit_blocks + 1 + returns
         if rows > len(self._hit):

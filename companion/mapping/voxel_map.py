@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -15,8 +15,10 @@ from companion.core.errors import InputError
 from companion.core.messages import Array, Array32
 from companion.mapping.blocks import BlockStore, Watch
 from companion.mapping.cold_region import Blocks
+from companion.mapping.end_voxels import end_voxels
 from companion.mapping.memory import Memory, MemoryConfig
-from companion.mapping.rays import BLOCK, CELLS, RayGrid
+from companion.mapping.rays import BLOCK, CELLS
+from companion.mapping.scan_rays import MapPool, ScanRays
 from companion.mapping.sensor_model import UNKNOWN, SensorModel, quantise
 from companion.mapping.shelf import Shelf
 
@@ -34,6 +36,9 @@ class VoxelMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     resolution_m: Annotated[float, msgspec.Meta(ge=0.02, le=2.0)] = 0.2  # edge of a voxel
     max_range_m: _Metres = 30.0  # longer rays clear up to here and hit nothing
     miss_clear_range_m: _Metres = 15.0  # beams without return clear up to here; at most max_range_m
+    ray_per: Literal["point", "end_voxel"] = "point"
+    """Rays of a scan: one to each point, or one to the centre of each voxel that holds points, OctoMap's discrete mode:
+    faster where points are dense, but what the other rays cross is not seen."""
     sensor: SensorModel = SensorModel()
     memory: MemoryConfig = MemoryConfig()
 
@@ -72,15 +77,25 @@ class VoxelMap:
     >>> voxels.classify(points + p)  # 0 unknown, 1 free, 2 occupied
     """
 
-    def __init__(self, config: VoxelMapConfig, *, decays: bool = False, shelf: Shelf | None = None) -> None:
-        """`decays`: `companion.mapping.decay` is called after every scan; `shelf`: where far blocks may lie."""
+    def __init__(
+        self,
+        config: VoxelMapConfig,
+        *,
+        decays: bool = False,
+        shelf: Shelf | None = None,
+        map_pool: MapPool | None = None,
+    ) -> None:
+        """`decays`: `companion.mapping.decay` is called after every scan; `shelf`: where far blocks may lie.
+
+        `map_pool`: as `map` of an Executor with two threads; they share the rays of a scan. The map is the same.
+        """
         self.config = config
         self.resolution_m = config.resolution_m
         self.steps = quantise(config.sensor)
         self.shelf = shelf
         self.blocks = BlockStore(marking=decays)  # for the other files of this package
         self.memory = _memory(self)  # far blocks, compressed: `blocks` holds the rest
-        self._grid = RayGrid(config.resolution_m, config.max_range_m)
+        self._rays = ScanRays(config.resolution_m, config.max_range_m, map_pool)
 
     @property
     def block_count(self) -> int:
@@ -131,15 +146,13 @@ class VoxelMap:
         _check_pose(R=R, p_odom=p, origin_odom=origin)
         points = _rows(points_body)
         misses = _rows(_NO_VECTORS if miss_dirs_body is None else miss_dirs_body)
-        far_m, clear_m = self.config.max_range_m, self.config.miss_clear_range_m
-        self._grid.place(origin)
-        self.memory.before_scan(self._grid.corner + self._grid.reach, self._grid.reach)
-        hit, steps = self._grid.cast(points, (R, p - origin, origin), (own_radius_m, far_m, False))
-        missed, more = self._grid.cast(misses, (R, np.zeros(3), origin), (0.0, clear_m, True))
-        self._grid.mark_free(free_odom[np.linalg.norm(free_odom - origin, axis=1) <= far_m])
-        met, changed = self.blocks.fold(self._grid, self.steps, stamp_ns, watch)
-        dropped = len(points) + len(misses) - hit - missed
-        return Delta(hit, missed, dropped, steps + more, met, changed)
+        self._rays.place(origin)
+        grid = self._rays.grid
+        self.memory.before_scan(grid.corner + grid.reach, grid.reach)
+        hit, missed, steps = self._cast((points, own_radius_m), misses, (R, p - origin, origin))
+        grid.mark_free(free_odom[np.linalg.norm(free_odom - origin, axis=1) <= self.config.max_range_m])
+        met, changed = self.blocks.fold(grid, self.steps, stamp_ns, watch)
+        return Delta(hit, missed, len(points) + len(misses) - hit - missed, steps, met, changed)
 
     def blank(self) -> VoxelMap:
         """An empty map of the same kind, which shares the scratch of insertion."""
@@ -200,6 +213,21 @@ class VoxelMap:
         voxels = cls(config, decays=decays, shelf=shelf)
         voxels.blocks.add(xyz, log_odds, voxels.steps.lowest, held=True)
         return voxels
+
+    def _cast(
+        self, returns: tuple[Array32, float], misses: Array32, pose: tuple[Array, Array, Array]
+    ) -> tuple[int, int, int]:
+        """(points, beams without return that count, voxel steps); `returns` = (points, own radius)."""
+        (points, near_m), (R, offset, origin) = returns, pose
+        to_points, far_m = self._rays.grid.to_grid(R, offset, origin), self.config.max_range_m
+        along = (misses, self._rays.grid.to_grid(R, np.zeros(3), origin), (0.0, self.config.miss_clear_range_m, True))
+        if self.config.ray_per == "point":
+            (hit, missed), steps = self._rays.cast([(points, to_points, (near_m, far_m, False)), along])
+            return hit, missed, steps
+        start = to_points[2]
+        centers, hit = end_voxels(points, to_points, near_m)
+        (_, missed), steps = self._rays.cast([(centers, (np.eye(3), -start, start), (0.0, far_m, False)), along])
+        return hit, missed, steps
 
     def _at(self, points_odom: Array) -> NDArray[np.int8]:
         points = np.asarray(points_odom, np.float64).reshape(-1, 3)

@@ -220,7 +220,7 @@ def _drop_scratch(voxels: VoxelMap) -> float:
     """What the process shrinks by when the ray grid goes; the map takes no scan after this."""
     gc.collect()
     before = rss_mb()
-    del voxels._grid
+    del voxels._rays
     gc.collect()
     return before - rss_mb()
 

@@ -11,6 +11,7 @@ from pyoctomap import OcTree
 from companion.core.errors import InputError
 from companion.mapping.sensor_model import SensorModel, quantise
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from tests.unit.mapping.reference_rays import known_voxels, room_scans
 
 STEPS = quantise(SensorModel())
 ORIGIN = np.array([0.31, -0.17, 1.53])
@@ -28,97 +29,7 @@ def look(voxels, points_odom, *, origin=ORIGIN, misses=None, **more):
     )
 
 
-def amanatides_woo(start, end, cell_m):
-    """The textbook's traversal: all voxels (tuples) from start to end."""
-    a, b = start / cell_m, end / cell_m
-    cell, last, d = np.floor(a).astype(int), np.floor(b).astype(int), b - a
-    step = np.where(d > 0, 1, -1)
-    with np.errstate(divide="ignore"):
-        t_next = np.where(d > 0, cell + 1 - a, a - cell) / np.abs(d)
-        t_step = 1 / np.abs(d)
-    seen = [tuple(int(c) for c in cell)]
-    for _ in range(int(np.abs(last - cell).sum())):
-        axis = int(np.argmin(t_next))
-        cell[axis] += step[axis]
-        t_next[axis] += t_step[axis]
-        seen.append(tuple(int(c) for c in cell))
-    assert seen[-1] == tuple(last)
-    return seen
-
-
 _SHARED = small()
-
-
-def random_rotation(rng):
-    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
-
-
-def expected_scan(points, misses, R, p, origin, config):
-    """(hit voxels, miss voxels) of one scan, by the reference traversal."""
-    hits, crossed = set(), set()
-    for v in points.astype(np.float64):
-        end = R @ v + p
-        length = np.linalg.norm(end - origin)
-        if length <= config.max_range_m:
-            voxels = amanatides_woo(origin, end, config.resolution_m)
-            hits.add(voxels[-1])
-        else:
-            end = origin + (end - origin) * config.max_range_m / length
-            voxels = amanatides_woo(origin, end, config.resolution_m)
-            voxels = voxels[:-1] or voxels
-        crossed.update(voxels)
-    for v in misses.astype(np.float64):
-        end = origin + R @ v * config.miss_clear_range_m / np.linalg.norm(v)
-        crossed.update(amanatides_woo(origin, end, config.resolution_m)[:-1])
-    return hits, crossed - hits
-
-
-def known_voxels(voxels):
-    """{voxel: steps} of every known voxel."""
-    arrays = voxels.to_arrays()
-    row, cell = np.nonzero(arrays["log_odds"] != -128)
-    xyz = 8 * arrays["block_xyz"][row] + np.stack([cell >> 6, cell >> 3 & 7, cell & 7], axis=1)
-    return dict(zip(map(tuple, xyz.tolist()), arrays["log_odds"][row, cell].tolist(), strict=True))
-
-
-@pytest.mark.parametrize("resolution_m", [0.2, 0.13])
-@pytest.mark.parametrize("seed", range(3))
-def test_every_voxel_of_random_scans_is_that_of_amanatides_and_woo(seed, resolution_m):
-    rng = np.random.default_rng(seed)
-    voxels = small(resolution_m=resolution_m)
-    expected = {}
-    for _ in range(3):
-        R, p = random_rotation(rng), rng.uniform(-30, 30, 3)
-        origin = p + R @ rng.uniform(-0.2, 0.2, 3)
-        points = (rng.normal(size=(250, 3)) * rng.uniform(0.1, 6, (250, 1))).astype(np.float32)
-        misses = rng.normal(size=(60, 3)).astype(np.float32)
-        delta = voxels.insert(points, R_odom_body=R, p_odom=p, origin_odom=origin, miss_dirs_body=misses)
-        assert (delta.returns, delta.misses, delta.dropped) == (250, 60, 0)
-        hits, crossed = expected_scan(points, misses, R, p, origin, voxels.config)
-        for group, step in ((hits, STEPS.hit), (crossed, STEPS.miss)):
-            for voxel in sorted(group):
-                level = expected.get(voxel, 0) + step
-                expected[voxel] = min(max(level, STEPS.lowest), STEPS.highest)
-    assert known_voxels(voxels) == expected
-
-
-def room_scans(rng, count, returns):
-    """Returns on the walls of a box room with pillars, from a wandering sensor, in odom."""
-    pillars = rng.uniform(-5, 5, (6, 2))
-    for _ in range(count):
-        origin = rng.uniform(-1.5, 1.5, 3)
-        d = rng.normal(size=(returns, 3))
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        with np.errstate(divide="ignore"):
-            reach = np.min((np.sign(d) * [7.0, 6.0, 2.5] - origin) / d, axis=1)
-        for pillar in pillars:
-            offset, flat = pillar - origin[:2], d[:, :2]
-            a, b = np.sum(flat**2, axis=1), flat @ offset
-            inside = b**2 - a * (offset @ offset - 0.16)
-            t = np.where((inside > 0) & (b > 0), (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
-            reach = np.where(t > 0, np.minimum(reach, t), reach)
-        yield origin, origin + d * (reach + rng.normal(0, 0.01, returns))[:, None]
 
 
 def test_classes_agree_with_octomap():
@@ -327,8 +238,8 @@ def test_nothing_of_a_scan_is_left_behind_for_the_next(seed):
     origin = 0.2 * rng.choice([0, 1, 4, 7, 8, 16], 3) * rng.choice([-1, 1], 3)
     ends = origin + 0.2 * rng.integers(-40, 41, (200, 3)) * rng.choice([0.0, 1.0, 1.0 + 1e-7], (200, 3))
     look(voxels, ends, origin=origin, misses=rng.integers(-1, 2, (50, 3)).astype(np.float32), free_odom=ends)
-    assert not voxels._grid.free.any()
-    assert not any(bits.any() for bits in voxels._grid.bits[1:])
+    assert not voxels._rays.grid.free.any()
+    assert not any(bits.any() for bits in voxels._rays.grid.bits[1:])
 
 
 def test_the_same_scans_give_the_same_bytes():
