@@ -165,6 +165,13 @@ class BlockStore:
         if len(self.xyz) > kept + 2 * _GROWTH:
             self._resize(kept + _GROWTH)
 
+    def let_go(self, blocks: int) -> bool:
+        """Drop so many blocks of a store that is not used any more; False: there were none."""
+        there = self.count > 0
+        self.count = max(self.count - blocks, 0)
+        self._resize(max(self.count, 1))
+        return there
+
     def _blank(self, first: int, last: int) -> None:
         """Make rows those of unknown blocks; `xyz` is the caller's matter."""
         self.log_odds[first:last] = UNKNOWN

@@ -89,10 +89,12 @@ class ColdStore:
         self._newest = self._new_version()
         self._gone[key] = (self._newest, places.tobytes())
 
-    def clear(self) -> None:
-        """Drop everything, as the map is not used any more."""
-        for key in list(self.regions):
-            self._drop(key)
+    def let_go(self, blocks: int) -> bool:
+        """Drop about that many blocks; False: there were none."""
+        least = self.blocks - blocks
+        while self.regions and self.blocks > least:
+            self._drop(next(reversed(self.regions)))
+        return least > -blocks
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Positions (K, 3) of blocks that changed after `version`, and those (of other blocks) forgotten since."""

@@ -1,8 +1,9 @@
 """The map follows when the pose graph corrects past poses (loop closure), beside insertion.
 
 A second map is built in bounded steps: the evidence of each stretch of the flight, moved to
-where the corrected poses put it, is added up. Meanwhile scans go on into the present map. In the
-last step the open stretch is added, too, and the second map takes the place of the first.
+where the corrected poses put it, is added up. Meanwhile scans go on into the present map. Then
+both are compared, so that others can be told what changes. In the last step the newest scans are
+added, too, and the second map takes the place of the first.
 The same idea with other means: V. Reijgwart et al., "Voxgraph", RA-L 2020 (submaps as signed
 distances, aligned by a pose graph).
 """
@@ -15,20 +16,19 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
 from companion.mapping.cold_region import unpack
+from companion.mapping.comparison import Comparison, any_known
 from companion.mapping.evidence import Levels, added
 from companion.mapping.moved_blocks import MovedBlocks
 from companion.mapping.pose_track import PoseCorrector, PoseShift
-from companion.mapping.rays import CELLS
 from companion.mapping.sensor_model import UNKNOWN
 from companion.mapping.submaps import Submap, SubmapConfig, Submaps
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 
 _LEAP = 1 << 40  # versions: more than insertion makes while a correction runs
 _PART = 2048  # blocks at a time: 1 MB, which a cache holds
+_LOOKS = 8  # blocks are compared in the time that one is added
 _STAY = PoseShift(np.eye(3), np.zeros(3))
 
 
@@ -62,11 +62,19 @@ class Correction:
         self.config = config
         self._voxels, self._submaps, self._poses = voxels, submaps, poses
         self._second = voxels.blank()
-        self._second.blocks.version = voxels.version + _LEAP  # whatever is in it counts as changed
-        self._loaded = self._next = self._moved = self._work = 0
+        self._least = self._second.blocks.version = voxels.version + _LEAP  # whatever is in it counts as changed
+        self._loaded = self._next = self._opened = self._moved = self._work = 0
         self._now: MovedBlocks | None = None
         self._first = 0  # block of `_now` that comes next
         self._last_ns = 0
+        self._comparison: Comparison | None = None
+        self._comparing = True
+        self._newest: Submap | None = None  # that was added before it was packed
+
+    @property
+    def replaced(self) -> VoxelMap:
+        """Once all is done: the map that was, which nobody needs."""
+        return self._second
 
     @property
     def needed(self) -> bool:
@@ -76,6 +84,7 @@ class Correction:
     def advance(self) -> Corrected | None:
         """One bounded step; None: there is more to do."""
         left = self.config.blocks_per_scan
+        self._submaps.joining = False  # stretches are counted
         self._keep_small()
         while left > 0:
             if self._now is not None:
@@ -87,7 +96,7 @@ class Correction:
                 self._next += 1
                 return None  # that was work enough
             else:
-                return self._finish() if self._submaps.settled else None
+                return self._end()
         return None
 
     def _shift(self, submap: Submap) -> PoseShift:
@@ -112,6 +121,7 @@ class Correction:
         self._now = MovedBlocks(submap.xyz, evidence, shift, self._voxels.resolution_m)
         self._first, self._last_ns = 0, submap.last_ns
         self._moved += shift is not _STAY
+        self._opened += 1
         self._keep_small()
 
     def _keep_small(self) -> None:
@@ -128,7 +138,7 @@ class Correction:
         assert self._now is not None
         first, last = self._first, min(self._first + count, len(self._now.xyz))
         values, xyz = self._now.cells(first, last), self._now.xyz[first:last]
-        known = np.flatnonzero(_any_known(values))
+        known = np.flatnonzero(any_known(values))
         values, xyz = values[known], xyz[known]
         blocks, steps = self._second.blocks, self._voxels.steps
         rows = blocks.rows_of(xyz.astype(np.int64))
@@ -147,43 +157,42 @@ class Correction:
             self._now = None
         return max(last - first, 1)
 
+    def _end(self) -> Corrected | None:
+        """The last steps, once all stretches at rest are added."""
+        submaps = self._submaps
+        if self._comparison is None:
+            if not submaps.settled:
+                return None
+            if submaps.open_blocks > self.config.blocks_per_scan:  # too many for one step
+                self._open_newest()
+            self._comparison = Comparison(self._voxels, self._second)
+            return None
+        if self._comparing:
+            self._comparing = self._comparison.advance(_LOOKS * self.config.blocks_per_scan)
+            return None
+        return self._finish() if submaps.waits_only_for(self._newest) else None
+
+    def _open_newest(self) -> None:
+        """End the open stretch, and move it before it is packed."""
+        closed = self._submaps.close()
+        if closed is not None:
+            self._newest = closed[0]
+            self._next += 1  # as it is then
+            self._open(*closed)
+
     def _finish(self) -> Corrected:
         """Add the open stretch, and put the second map in the place of the first."""
-        open_stretch = self._submaps.close()
-        if open_stretch is not None:
-            self._open(*open_stretch)
-            while self._now is not None:
-                self._add(_PART)
-        changed = self._tell_changes()
-        self._voxels.replace(self._second)
-        total = len(self._submaps.closed) + (open_stretch is not None)
-        return Corrected(self._moved, total - self._moved, self._voxels.block_count, changed, self._work)
-
-    def _tell_changes(self) -> int:
-        """Give each block of the second map the version of its last change; returns how many change now.
-
-        A block that has gone stays as an unknown one, so that `changed_since` can name it. What is
-        compressed counts as changed.
-        """
-        old, new = self._voxels.blocks, self._second.blocks
-        gone = self._gone()
-        new.add(gone, np.full((len(gone), CELLS), UNKNOWN, np.int8), self._voxels.steps.lowest, held=False)
-        new.mark_changed(np.empty(0, np.int64))
-        rows = old.rows_of(new.xyz[: new.count].astype(np.int64))
-        same = np.empty(new.count, np.bool_)
-        _same_classes(new.log_odds, rows, old.log_odds, same)
-        new.changed_at[: new.count] = np.where(same, old.changed_at[rows], new.version)
-        return int(self._second.block_count - np.count_nonzero(same))
-
-    def _gone(self) -> NDArray[np.int32]:
-        """Positions (N, 3) of the blocks that the second map does not have."""
-        xyz = self._voxels.blocks.xyz[: self._voxels.blocks.count]
-        if self._voxels.memory.cold_regions:
-            xyz = np.concatenate([xyz, self._voxels.memory.changed_since(-1)])
-        xyz = xyz[self._second.blocks.rows_of(xyz.astype(np.int64)) < 0]
-        if self._second.memory.cold_regions and len(xyz):
-            xyz = xyz[~_any_known(self._second.memory.log_odds_of(xyz.astype(np.int64)))]
-        return xyz
+        assert self._comparison is not None
+        self._open_newest()
+        while self._now is not None:
+            self._add(_PART)
+        self._comparison.finish()
+        new = self._second.blocks
+        changed = np.count_nonzero(new.changed_at[: new.count] >= self._least) + self._second.memory.cold_blocks
+        self._voxels.swap(self._second)
+        self._submaps.joining = True
+        blocks = self._voxels.block_count
+        return Corrected(self._moved, self._opened - self._moved, blocks, int(changed), self._work)
 
 
 def warm_correction(config: VoxelMapConfig) -> None:
@@ -201,27 +210,3 @@ def warm_correction(config: VoxelMapConfig) -> None:
     correction = Correction(CorrectionConfig(), voxels, submaps, poses)
     while correction.advance() is None:
         pass
-
-
-@njit(cache=True, nogil=True)
-def _any_known(values):  # type: ignore[no-untyped-def]
-    found = np.zeros(values.shape[0], np.bool_)
-    for n in range(values.shape[0]):
-        most = np.int8(UNKNOWN)
-        for c in range(CELLS):
-            most = max(most, values[n, c])
-        found[n] = most != np.int8(UNKNOWN)
-    return found
-
-
-@njit(cache=True, nogil=True)
-def _same_classes(new, rows, old, same):  # type: ignore[no-untyped-def]
-    """Whether each block has the classes of its row in `old`; a row of -1 has no block."""
-    unknown, zero = np.int8(UNKNOWN), np.int8(0)
-    for n in range(rows.size):
-        differ = np.int8(0 if rows[n] >= 0 else -1)
-        for c in range(CELLS if rows[n] >= 0 else 0):
-            a, b = new[n, c], old[rows[n], c]
-            differ = np.int8(differ | np.int8(a ^ b))  # its sign bit: occupied <-> free or unknown
-            differ = np.int8(differ | (unknown if (a == unknown) != (b == unknown) else zero))
-        same[n] = differ >= zero

@@ -12,6 +12,8 @@ from companion.mapping.pose_track import PoseCorrector
 from companion.mapping.submaps import SubmapConfig, Submaps
 from companion.mapping.voxel_map import VoxelMap
 
+_LET_GO = 32_768  # blocks per scan: giving much memory back takes time, too
+
 
 class FollowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Whether and how the map follows corrected poses."""
@@ -36,6 +38,7 @@ class MapFollower:
         self.skipped = 0  # corrections that were no poses, or of no flight
         self._running: Correction | None = None
         self._waiting: PoseCorrector | None = None
+        self._replaced: VoxelMap | None = None  # the map before the last correction, on its way out
 
     @property
     def watch(self) -> Watch | None:
@@ -66,9 +69,12 @@ class MapFollower:
         self.submaps.after_scan(stamp_ns, p_odom, q_odom_body)
         if self._running is None:
             self._running = self._begin()
-        done = self._running.advance() if self._running else None
-        if done:
-            self._running = None
+        if self._replaced and not self._replaced.let_go(_LET_GO):
+            self._replaced = None
+        running = self._running
+        done = running.advance() if running else None
+        if running and done:
+            self._running, self._replaced = None, running.replaced
         return done
 
     def _begin(self) -> Correction | None:

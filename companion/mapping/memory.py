@@ -121,9 +121,9 @@ class Memory:
         cold = self.cold.regions.items()
         self._wake(sorted(k for k, region in cold if region.seen_ns[0] <= last_ns and region.seen_ns[1] >= first_ns))
 
-    def clear(self) -> None:
-        """Let go of what is on a shelf; the map is not used any more."""
-        self.cold.clear()
+    def let_go(self, blocks: int) -> bool:
+        """Drop about that many cold blocks, as the map is not used any more; False: there were none."""
+        return self.cold.let_go(blocks)
 
     def at(self, cells: NDArray[np.int64], found: NDArray[np.int8]) -> None:
         """Fill in the log-odds `found` (N,) of `cells` (N, 3) that lie in cold regions."""

@@ -73,6 +73,7 @@ class Submaps:
         self.track = PoseTrack()  # of each scan, in `odom`
         self.closed: list[Submap] = []
         self.loaded = _loaded(voxels)
+        self.joining = True  # stretches may be joined
         self._closing: list[tuple[Submap, Levels]] = []  # with the part that is not packed yet
         self._anchor_ns: int | None = None  # None: no scan yet
         self._at: Array | None = None  # where the newest scan of the open stretch was
@@ -91,6 +92,15 @@ class Submaps:
     def settled(self) -> bool:
         """No stretch waits to be packed."""
         return not self._closing
+
+    @property
+    def open_blocks(self) -> int:
+        """Blocks of the open stretch."""
+        return self._before.count
+
+    def waits_only_for(self, submap: Submap | None) -> bool:
+        """No stretch but this one waits to be packed."""
+        return all(one is submap for one, _ in self._closing)
 
     def watch(self, met: NDArray[np.int64], rows: NDArray[np.int64], bits: ScanBits) -> None:
         """Note what a scan is about to change; the argument `watch` of `VoxelMap.insert`."""
@@ -149,7 +159,7 @@ class Submaps:
         self._closing[0] = (submap, values[count:])
         if len(values) <= count:
             self.closed.append(self._closing.pop(0)[0])
-            if sum(part.memory_bytes for part in self.closed) > 1e6 * self.config.budget_mb:
+            if self.joining and sum(part.memory_bytes for part in self.closed) > 1e6 * self.config.budget_mb:
                 self._join()
 
     def _join(self) -> None:
