@@ -161,10 +161,14 @@ class VoxelMap:
         other.memory = _memory(other)
         return other
 
-    def replace(self, other: VoxelMap) -> None:
-        """Become what `other`, made by `blank`, is; that must not be used any more."""
-        self.memory.clear()
-        self.blocks, self.memory = other.blocks, other.memory
+    def swap(self, other: VoxelMap) -> None:
+        """Become what `other`, made by `blank`, is, and the other way round."""
+        self.blocks, other.blocks = other.blocks, self.blocks
+        self.memory, other.memory = other.memory, self.memory
+
+    def let_go(self, blocks: int) -> bool:
+        """Drop about that many blocks of a map that is not used any more; False: there is nothing left."""
+        return self.memory.let_go(blocks) or self.blocks.let_go(blocks)
 
     def query(self, points_odom: Array) -> Array32:
         """Log-odds (N,) of being occupied at points (N, 3), m; NaN: unknown."""
