@@ -5,9 +5,10 @@ from __future__ import annotations
 from numba import njit
 
 from companion.planning.grid import segment_free
-from companion.planning.tree import add, gap, nearest, way_to
+from companion.planning.tree import add, gap, nearest, nearest_of, way_to
 
 DRAWS = 3  # uniforms per iteration
+_FEW = 300  # nodes that are looked at one by one
 
 
 @njit(cache=True, nogil=True)
@@ -42,7 +43,8 @@ def connect(steps, nodes, links, heads, counts, box, draws, step, bucket, out): 
 def _extend(steps, nodes, links, head, counts, which, step, bucket):  # type: ignore[no-untyped-def]
     """Move the new node's position to within a step of its nearest node; add it if the edge is free."""
     new = counts[which]
-    from_ = nearest(nodes, links, head, nodes[new : new + 1], bucket)
+    x = nodes[new : new + 1]
+    from_ = nearest_of(nodes, new, x) if new < _FEW else nearest(nodes, links, head, x, bucket)
     far = gap(nodes, from_, nodes, new)
     if far > step:
         for k in range(3):

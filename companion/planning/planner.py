@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from companion.core.messages import Array
 from companion.planning.space import Space
 
-PlannerName = Literal["rrt_star", "rrt", "rrt_connect", "prm", "prm_star", "dijkstra", "astar", "theta_star"]
+PlannerName = Literal[
+    "portfolio", "rrt_star", "rrt", "rrt_connect", "prm", "prm_star", "dijkstra", "astar", "theta_star"
+]
 Proof = Literal["", "optimal", "infeasible"]
 
 
@@ -87,3 +89,12 @@ def refused(start: Array, goal: Array, space: CellSpace) -> Plan | None:
     if inside and bool(space.free(np.stack([start, goal])).all()):
         return None
     return Plan(path=start[None].copy(), cost_m=float("inf"), iterations=0, solved=False)
+
+
+def trivial(start: Array, goal: Array, space: CellSpace) -> Plan | None:
+    """The answer that needs no search: ends that are not free, or a free straight way; None: there is none."""
+    refusal = refused(start, goal, space)
+    if refusal is not None or not space.segment_free(start, goal):
+        return refusal
+    straight = np.stack([start, goal])
+    return Plan(path=straight, cost_m=float(np.linalg.norm(goal - start)), iterations=0, solved=True, proof="optimal")

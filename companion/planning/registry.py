@@ -12,6 +12,7 @@ import msgspec
 from companion.core.errors import InputError
 from companion.planning.lattice.planner import AStar, Dijkstra, LatticeConfig, ThetaStar
 from companion.planning.planner import Planner
+from companion.planning.portfolio import Portfolio, PortfolioConfig
 from companion.planning.roadmap import PRM, PRMStar, RoadmapConfig
 from companion.planning.rrt import RRT, RRTConfig, RRTConnect
 from companion.planning.rrt_star import RRTStar, RRTStarConfig
@@ -20,6 +21,7 @@ from companion.planning.rrt_star import RRTStar, RRTStarConfig
 class PlannerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of every planner, also of those that do not fly."""
 
+    portfolio: PortfolioConfig = PortfolioConfig()
     rrt_star: RRTStarConfig = RRTStarConfig()
     rrt: RRTConfig = RRTConfig()
     roadmap: RoadmapConfig = RoadmapConfig()
@@ -27,6 +29,7 @@ class PlannerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 PLANNERS: dict[str, Callable[[PlannerSettings], Planner]] = {
+    "portfolio": lambda settings: Portfolio(settings.portfolio, settings.rrt_star),
     "rrt_star": lambda settings: RRTStar(settings.rrt_star),
     "rrt": lambda settings: RRT(settings.rrt),
     "rrt_connect": lambda settings: RRTConnect(settings.rrt),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from companion.core.messages import Array
 from companion.planning import connect as two_trees
 from companion.planning import grow, shortcut
-from companion.planning.planner import CellSpace, Plan, refused
+from companion.planning.planner import CellSpace, Plan, trivial
 from companion.planning.polyline import length, without_repeats
 from companion.planning.tree import COST, NEVER, PARENT, add, way_to
 
@@ -53,7 +53,7 @@ class RRTStar:
     def __init__(self, config: RRTStarConfig) -> None:
         self.config = config
         self._memory: _Memory | None = None
-        self._last: _Search | None = None
+        self._last: Search | None = None
 
     def edges(self) -> Array:
         """All edges (E, 2, 3) of the last plan's tree, odom, m: for pictures."""
@@ -75,20 +75,24 @@ class RRTStar:
         old path, need not be valid or fit the ends. With more iterations and the same `rng`
         state the cost never rises.
         """
-        refusal = refused(start, goal, space)
-        if refusal is not None:
-            return refusal
-        if space.segment_free(start, goal):
-            straight = np.stack([start, goal])
-            return Plan(path=straight, cost_m=length(straight), iterations=0, solved=True)
-        search = self._last = _Search(self.config, space, self._scratch(space, iterations), start, goal)
-        if known_path is not None and len(known_path):
-            search.take_known(known_path)
+        answer = trivial(start, goal, space)
+        if answer is not None:
+            return answer
+        search = self._last = self.begin(start, goal, space, iterations=iterations, known_path=known_path)
         done = 0
         while done < iterations:
             search.advance(rng)
             done += self.config.chunk
         return search.result(done)
+
+    def begin(
+        self, start: Array, goal: Array, space: CellSpace, *, iterations: int, known_path: Array | None = None
+    ) -> Search:
+        """A search with memory for so many samples; it uses this planner's memory, so one at a time."""
+        search = Search(self.config, space, self._scratch(space, iterations), start, goal)
+        if known_path is not None and len(known_path):
+            search.take_known(known_path)
+        return search
 
     def _scratch(self, space: CellSpace, iterations: int) -> _Memory:
         nodes = iterations + self.config.chunk + _SPARE_NODES
@@ -125,21 +129,21 @@ class _Memory:
         add(self.nodes[which], self.links[which], self.heads[which], 0, -1, bucket)
 
 
-class _Search:
-    """One run: the tree, the best path so far, and rounds of growing and shortening."""
+class Search:
+    """One run: the tree, the best path so far, and rounds of growing and shortening. Lengths in cells."""
 
     def __init__(self, config: RRTStarConfig, space: CellSpace, memory: _Memory, start: Array, goal: Array) -> None:
-        self._config, self._space, self._memory = config, space, memory
+        self.config, self._space, self._memory = config, space, memory
         self._ends = space.to_cells(np.stack([start, goal]))
         self._bucket = config.bucket_m / space.resolution_m
         memory.plant(0, self._ends, self._bucket)
         self._tree = (memory.nodes[0], memory.links[0], memory.heads[0])
         self._counts = np.array([2, 0, grow.START])
         self._best, self._path = np.zeros((_PATH_POINTS, 3)), memory.path
-        self._best_cost = NEVER
+        self.best_cost = NEVER
         self._forced = np.zeros((0, 3))
         self._box = space.sample_box
-        self._frame = np.vstack([_axes(self._ends[1] - self._ends[0]), self._ends.mean(axis=0)])
+        self._frame: Array | None = None
         self._pair: NDArray[np.int64] | None = None  # node counts of RRT-Connect's trees
 
     def take_known(self, path: Array) -> None:
@@ -159,20 +163,53 @@ class _Search:
 
     def advance(self, rng: np.random.Generator) -> None:
         """One chunk: towards a first path, or growth; then shortening of the best path."""
-        config = self._config
-        draws = rng.random((config.chunk, grow.DRAWS))
-        attempts = rng.random((config.shortcuts, shortcut.DRAWS))
-        if config.first and self._best_cost >= NEVER and not len(self._forced):
-            self._join(draws)
+        if self.solved:
+            self.grow(rng)
         else:
-            rest = (self._counts, self._best, self._frame, self._box, draws, self._forced, self._settings())
-            grow.grow(self._space.steps, *self._tree, *rest)
-            self._forced = self._forced[:0]
-            self._keep_if_better()
+            self.first(rng)
+        self.shorten(rng)
+
+    def first(self, rng: np.random.Generator) -> None:
+        """One chunk towards a first path: RRT-Connect, but for samples that are given, and unless configured."""
+        if self.config.first and not len(self._forced):
+            self.join(rng)
+        else:
+            self.grow(rng)
+
+    @property
+    def solved(self) -> bool:
+        """Is there a path?"""
+        return self.best_cost < NEVER
+
+    def grow(self, rng: np.random.Generator) -> None:
+        """One chunk of samples for RRT*."""
+        draws = rng.random((self.config.chunk, grow.DRAWS))
+        if self._frame is None:
+            self._frame = np.vstack([_axes(self._ends[1] - self._ends[0]), self._ends.mean(axis=0)])
+        rest = (self._counts, self._best, self._frame, self._box, draws, self._forced, self._settings())
+        grow.grow(self._space.steps, *self._tree, *rest)
+        self._forced = self._forced[:0]
+        self._keep_if_better()
+
+    def shorten(self, rng: np.random.Generator, attempts: int | None = None) -> None:
+        """Shorten the best path; None: as often as configured."""
         count = int(self._counts[grow.BEST])
-        if count:
+        if count > 2:
             self._path[:count] = self._best[:count]
-            count = shortcut.shorten(self._space.steps, self._path, count, attempts)
+            self._shorten(count, rng, self.config.shortcuts if attempts is None else attempts)
+
+    def offer(self, path: Array, rng: np.random.Generator, attempts: int) -> None:
+        """A free path (N, 3) between the ends that another planner found: shorten it, take it if it is better."""
+        if len(path) > len(self._path):
+            return
+        self._leave_pair()
+        self._path[: len(path)] = path
+        self._shorten(len(path), rng, attempts)
+
+    def _shorten(self, count: int, rng: np.random.Generator, attempts: int) -> None:
+        draws = rng.random((attempts, shortcut.DRAWS))
+        count = shortcut.shorten(self._space.steps, self._path, count, draws)
+        if length(self._path[:count]) < self.best_cost - 1e-9:
             self._hang(self._path[:count])
             self._keep_if_better()
 
@@ -192,32 +229,40 @@ class _Search:
         hung = np.flatnonzero(links[: int(self._counts[grow.NODES]), PARENT] >= 0)
         return self._space.to_odom(np.stack([nodes[hung, :3], nodes[links[hung, PARENT], :3]], axis=1))
 
-    def _join(self, draws: Array) -> None:
-        """RRT-Connect; its start tree lies in the place of RRT*'s, which is empty until there is a path."""
+    def join(self, rng: np.random.Generator) -> None:
+        """One chunk of RRT-Connect; its start tree lies in the place of RRT*'s, empty until there is a path."""
+        draws = rng.random((self.config.chunk, two_trees.DRAWS))
         memory = self._memory
         if self._pair is None:
             memory.plant(0, self._ends[:1], self._bucket)
             memory.plant(1, self._ends[1:], self._bucket)
             self._pair = np.array([1, 1])
-        step = self._config.step_m / self._space.resolution_m
+        step = self.config.step_m / self._space.resolution_m
         trees = (memory.nodes, memory.links, memory.heads)
         arguments = (self._pair, self._box, draws, step, self._bucket, self._path)
         count = two_trees.connect(self._space.steps, *trees, *arguments)
         if count:
-            memory.plant(0, self._ends, self._bucket)
+            self._leave_pair()
             self._hang(without_repeats(self._path[:count]))
             self._keep_if_better()
+
+    def _leave_pair(self) -> None:
+        """Give RRT*'s tree its place back."""
+        if self._pair is not None:
+            self._memory.plant(0, self._ends, self._bucket)
+            self._counts[:] = 2, 0, grow.START
+            self._pair = None
 
     def _hang(self, path: Array) -> None:
         grow.add_chain(*self._tree, self._counts, self._bucket, np.ascontiguousarray(path))
 
     def _keep_if_better(self) -> None:
-        if self._tree[0][grow.GOAL, COST] < self._best_cost - 1e-9 and self._counts[grow.NODES] > 2:
+        if self._tree[0][grow.GOAL, COST] < self.best_cost - 1e-9 and self._counts[grow.NODES] > 2:
             count = self._way_to(grow.GOAL)
             if count:
                 self._best[:count] = self._path[:count]
                 self._counts[grow.BEST] = count
-                self._best_cost = length(self._best[:count])
+                self.best_cost = length(self._best[:count])
 
     def _way_to(self, node: int) -> int:
         return int(way_to(self._tree[0], self._tree[1], node, self._path))
@@ -230,12 +275,12 @@ class _Search:
 
     def _settings(self) -> Array:
         """Numbers for `grow`; the neighbourhood shrinks with log(n)/n (Karaman and Frazzoli 2011)."""
-        config, cell = self._config, self._space.resolution_m
+        config, cell = self.config, self._space.resolution_m
         n = int(self._counts[grow.NODES])
         volume = float(self._space.steps.size)
-        if self._best_cost < NEVER:
+        if self.best_cost < NEVER:
             c_min = float(np.linalg.norm(self._ends[1] - self._ends[0]))
-            volume = min(volume, math.pi / 6.0 * self._best_cost * max(self._best_cost**2 - c_min**2, 1.0))
+            volume = min(volume, math.pi / 6.0 * self.best_cost * max(self.best_cost**2 - c_min**2, 1.0))
         gamma = config.radius_factor * 2.0 * (4.0 / 3.0 * volume / (4.0 / 3.0 * math.pi)) ** (1.0 / 3.0)
         radius = min(gamma * (math.log(n) / n) ** (1.0 / 3.0), config.step_m / cell)
         settings = np.zeros(6)

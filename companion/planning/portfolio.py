@@ -1,0 +1,165 @@
+"""Several planners that help each other: the straight line, RRT-Connect, a coarse-to-fine lattice, RRT*.
+
+A first way comes from RRT-Connect, which is fast where there is room. If a few samples do not find one, a flood fill
+says whether there is a way at all; if there is, Lazy Theta* looks for it from coarse to fine, beside RRT-Connect. From
+then on RRT* and shortcuts better the way, and the finer lattices look for shorter ones elsewhere.
+
+>>> planner = Portfolio(PortfolioConfig(), RRTStarConfig())
+>>> plan = planner.plan(start, goal, space, rng=np.random.default_rng(1), iterations=1000)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.messages import Array
+from companion.planning.lazy_theta import COARSEST, LazyTheta
+from companion.planning.planner import CellSpace, Plan, trivial
+from companion.planning.reach import reachable
+from companion.planning.rrt_star import RRTStar, RRTStarConfig, Search
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+_LEVELS = ((3, COARSEST), (2, COARSEST), (1, COARSEST), (0, COARSEST), (0, 0))
+"""Finest and coarsest lattice of the searches, one after the other; the last has every cell."""
+
+
+class PortfolioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Who works how much."""
+
+    alone: Count = 400
+    """Samples of RRT-Connect before the lattice helps; if these find a way, the world counts as easy."""
+    hard_expansions: Count = 400
+    """Expansions of the lattice per round in worlds that are not easy."""
+    easy_expansions: Count = 40
+    """And in easy ones, beside RRT*."""
+    first_shortcuts: Count = 200
+    """Attempts to shorten what RRT-Connect or the lattice found."""
+
+
+class Portfolio:
+    """Keeps only scratch memory, so a plan depends on its arguments alone."""
+
+    def __init__(self, config: PortfolioConfig, rrt_star: RRTStarConfig) -> None:
+        self.config = config
+        self._rrt_star, self._lattice = RRTStar(rrt_star), LazyTheta()
+
+    def plan(
+        self,
+        start: Array,
+        goal: Array,
+        space: CellSpace,
+        *,
+        rng: np.random.Generator,
+        iterations: int,
+        known_path: Array | None = None,
+    ) -> Plan:
+        """Shortest way found with at most `iterations` samples, in whole chunks; none: Plan.proof is `infeasible`.
+
+        If a way exists it is found, however few the samples: the lattice ends by itself. With more iterations and
+        the same `rng` state the cost never rises.
+        """
+        answer = trivial(start, goal, space)
+        if answer is not None:
+            return answer
+        search = self.begin(start, goal, space, iterations=iterations, known_path=known_path)
+        while search.samples < iterations or not search.ended:
+            search.advance(rng)
+            if search.infeasible:
+                break
+        return search.result()
+
+    def begin(
+        self, start: Array, goal: Array, space: CellSpace, *, iterations: int, known_path: Array | None = None
+    ) -> PortfolioSearch:
+        """A search to be advanced in portions; it uses this planner's memory, so one at a time."""
+        tree = self._rrt_star.begin(start, goal, space, iterations=iterations, known_path=known_path)
+        ends = space.to_cells(np.stack([start, goal]))
+        return PortfolioSearch(self.config, tree, self._lattice, space, ends)
+
+
+class PortfolioSearch:
+    """One run in rounds: `advance` until it is `infeasible`, or good enough."""
+
+    def __init__(
+        self, config: PortfolioConfig, tree: Search, lattice: LazyTheta, space: CellSpace, ends: Array
+    ) -> None:
+        self._config, self._tree, self._lattice, self._space, self._ends = config, tree, lattice, space, ends
+        self._levels = list(_LEVELS)
+        self._looking = self._known_reachable = False
+        self._is_new = True  # the first way is not shortened yet
+        self.infeasible = False
+        self.samples = self._samples_first = 0
+
+    @property
+    def solved(self) -> bool:
+        """Is there a way?"""
+        return self._tree.solved
+
+    @property
+    def ended(self) -> bool:
+        """Is it known whether there is a way?"""
+        return self.solved or self.infeasible
+
+    @property
+    def cost_m(self) -> float:
+        """Length of the best way; infinite: none yet."""
+        return self._tree.best_cost * self._space.resolution_m if self.solved else math.inf
+
+    def advance(self, rng: np.random.Generator) -> None:
+        """One round: one chunk of samples, and a portion of the lattice; a first way is shortened in the next."""
+        tree, config = self._tree, self._config
+        self.samples += tree.config.chunk
+        if self.solved:
+            self._better(rng)
+            return
+        self._samples_first = self.samples
+        tree.first(rng)
+        if not self.solved and self.samples >= config.alone:
+            self._look(config.hard_expansions, rng)
+
+    def _better(self, rng: np.random.Generator) -> None:
+        if self._is_new:
+            self._is_new = False
+            self._tree.shorten(rng, self._config.first_shortcuts)
+            return
+        easy = self._samples_first <= self._config.alone
+        self._look(self._config.easy_expansions if easy else self._config.hard_expansions, rng)
+        self._tree.grow(rng)
+        self._tree.shorten(rng)
+
+    def _look(self, expansions: int, rng: np.random.Generator) -> None:
+        """Search on; a lattice that has ended makes room for the next finer one."""
+        if not self._levels:
+            return
+        if not self._looking:
+            self._begin_level()
+        state = self._lattice.advance(expansions)
+        if state == "open":
+            return
+        self._looking = False
+        self._levels.pop(0)
+        if state == "found":
+            self._tree.offer(self._lattice.path()[::-1], rng, self._config.first_shortcuts)
+        elif not self.solved and not self._known_reachable:
+            self._prove()
+
+    def _begin_level(self) -> None:
+        """From the goal to the start: if one of them is enclosed, it is rather the goal."""
+        self._looking, backwards = True, self._ends[::-1]
+        self._lattice.begin(self._space.steps, backwards, levels=self._levels[0], weight=1.0, most=self._tree.best_cost)
+
+    def _prove(self) -> None:
+        """Flood fill, once."""
+        start, goal = np.floor(self._ends).astype(np.int64)
+        self._known_reachable = reachable(self._space.steps, start, goal)
+        self.infeasible = not self._known_reachable
+
+    def result(self) -> Plan:
+        """The best way, or the proof that there is none."""
+        plan = self._tree.result(self.samples)
+        return replace(plan, proof="infeasible") if self.infeasible else plan
