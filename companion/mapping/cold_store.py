@@ -96,27 +96,34 @@ class ColdStore:
             self._drop(next(reversed(self.regions)))
         return least > -blocks
 
-    def changed_since(self, version: int) -> NDArray[np.int32]:
-        """Positions (K, 3) of blocks that changed after `version`, and those (of other blocks) forgotten since."""
-        parts = [np.empty((0, 3), np.int32)]
+    def changes_since(self, version: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """Positions (K, 3) of blocks that changed after `version`, and those (of other blocks) forgotten since.
+
+        For each the version (K,) of that, or one between: not all data is fetched for it.
+        """
+        parts, versions = [np.empty((0, 3), np.int32)], [np.empty(0, np.int64)]
         if self._newest <= version:
-            return parts[0]
+            return parts[0], versions[0]
         for key in sorted(key for key, region in self.regions.items() if region.changes[1] > version):
-            parts.append(self._changed(key, version))
+            xyz, changed_at = self._changes(key, version)
+            parts.append(xyz)
+            versions.append(changed_at)
         for key in sorted(key for key, gone in self._gone.items() if gone[0] > version):
             places = np.frombuffer(self._gone[key][1], np.uint8)
             if key in self.regions:
                 places = places & ~np.frombuffer(self.regions[key].places, np.uint8)
             parts.append(blocks_at(places.tobytes(), key))
-        return np.concatenate(parts)
+            versions.append(np.full(len(parts[-1]), self._gone[key][0]))
+        return np.concatenate(parts), np.concatenate(versions)
 
-    def _changed(self, key: int, version: int) -> NDArray[np.int32]:
+    def _changes(self, key: int, version: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         region = self.regions[key]
         xyz = xyz_of(region, key)
-        if region.changes[0] > version:
-            return xyz
-        whole = self._whole(key)
-        return xyz[unpack_rest(whole)["changed_at"] > version] if whole else xyz
+        whole = self._whole(key) if region.changes[0] <= version else None
+        if whole is None:
+            return xyz, np.full(len(xyz), max(region.changes[0], version + 1))
+        changed_at = unpack_rest(whole)["changed_at"]
+        return xyz[changed_at > version], changed_at[changed_at > version]
 
     def _whole(self, key: int) -> ColdRegion | None:
         try:

@@ -19,6 +19,7 @@ from companion.mapping.voxel_map import VoxelMap
 
 RECORD = np.dtype([("xyz", "<i4", 3), ("states", "u1", CELLS // 4)])
 _FRAME = {"content_checksum": True, "store_size": False}  # 0.2 us, 36 bytes per block; zlib's 31 bytes take 1 us
+_AGAIN, _AT_ONCE = 6, 4096  # how often what changed during a walk is walked through; blocks that its end may add
 _MOST_BLOCKS = 1 << 22  # 0.6 GB of records: no message is larger
 _HALF_RANGE = 1 << 20  # of block numbers, as in the hash
 u16, u64 = np.uint16, np.uint64
@@ -54,16 +55,27 @@ def keys_of(block_xyz: NDArray[np.int32]) -> NDArray[np.int64]:
     return keys
 
 
-def delta_since(voxels: VoxelMap, version: int, *, stamp_ns: int, map_ns: int) -> MapDelta | None:
-    """What changed after `version` as a message; None: nothing. `map_ns` is the stamp of the map's first scan."""
-    changed = in_order(voxels.changed_since(version))
+def delta_since(
+    voxels: VoxelMap, version: int, *, stamp_ns: int, map_ns: int, most: int = _MOST_BLOCKS
+) -> MapDelta | None:
+    """What changed after `version` as a message; None: nothing. `map_ns` is the stamp of the map's first scan.
+
+    Of more than `most` blocks, those that changed first, up to the `version_to` of the message; blocks of
+    one version stay together.
+    """
+    changed, versions = voxels.changes_since(version)
     if len(changed) == 0:
         return None
+    version_to = voxels.version
+    if len(changed) > most:
+        version_to = int(np.partition(versions, most - 1)[most - 1])
+        changed = changed[versions <= version_to]
+    changed = in_order(changed)
     return MapDelta(
         stamp_ns=stamp_ns,
         map_ns=map_ns,
         version_from=version,
-        version_to=voxels.version,
+        version_to=version_to,
         resolution_m=voxels.resolution_m,
         block_count=len(changed),
         data=lz4.frame.compress(records_of(voxels, changed).tobytes(), **_FRAME),
@@ -76,13 +88,14 @@ class FullWalk:
     >>> walk = FullWalk(voxels, map_ns=0)
     >>> while (full := walk.advance(voxels, blocks=250, stamp_ns=now_ns)) is None: ...
 
-    What was packed early may change before the end: the last step adds what changed since the
-    first, so that the message tells the map of its own `version_to`.
+    What was packed early may change before the end: what has changed meanwhile is packed again, a few
+    times if that is much; the last step adds what changed since the last time, so that the message
+    tells the map of its own `version_to`.
     """
 
     def __init__(self, voxels: VoxelMap, *, map_ns: int) -> None:
         self._map_ns = map_ns
-        self._begun = voxels.version
+        self._begun, self._again = voxels.version, _AGAIN
         self._left = in_region_order(voxels.changed_since(-1))  # so that each cold region is unpacked once or twice
         self._stream = lz4.frame.LZ4FrameCompressor(content_checksum=True)
         self._parts: list[bytes] = [self._stream.begin()]
@@ -94,7 +107,11 @@ class FullWalk:
         self._left = self._left[blocks:]
         if len(self._left):
             return None
-        self._add(voxels, in_order(voxels.changed_since(self._begun)))
+        changed = voxels.changed_since(self._begun)
+        if len(changed) > _AT_ONCE and self._again > 0:
+            self._begun, self._left, self._again = voxels.version, in_region_order(changed), self._again - 1
+            return None
+        self._add(voxels, in_order(changed))
         self._parts.append(self._stream.flush())
         return MapDelta(
             stamp_ns=stamp_ns,

@@ -147,10 +147,13 @@ class Memory:
             found[where[part][there]] = blocks["log_odds"][row[there]]
         return found
 
-    def changed_since(self, version: int) -> NDArray[np.int32]:
-        """Positions (K, 3) of cold or forgotten blocks in which a voxel changed its class after `version`."""
-        xyz = self.cold.changed_since(version)
-        return xyz[self._blocks.rows_of(xyz.astype(np.int64)) < 0] if self.forgotten_blocks else xyz
+    def changes_since(self, version: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """`VoxelMap.changes_since` of the cold and forgotten blocks."""
+        xyz, versions = self.cold.changes_since(version)
+        if self.forgotten_blocks == 0:
+            return xyz, versions
+        gone = self._blocks.rows_of(xyz.astype(np.int64)) < 0
+        return xyz[gone], versions[gone]
 
     def parts(self) -> Iterator[Blocks]:
         """The whole map, region by region in one order whatever is cold; the map must not change meanwhile."""

@@ -25,8 +25,10 @@ class ShareConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     occupied_every: _Scans = 5  # scans per cloud of occupied voxels, for viewers
     occupied_radius_m: Annotated[float, msgspec.Meta(gt=0.0)] = 30.0
-    """Around the vehicle; blocks that memory has put away are left out all the same."""
+    """Around the vehicle, at most the map's `max_range_m`: so far, nothing is ever put away."""
     delta_every: _Scans = 10  # scans per delta
+    delta_blocks: Annotated[int, msgspec.Meta(ge=1)] = 8192
+    """Of a delta, about: after a correction the whole map may have changed, which is told scan by scan."""
     full_every: _Scans = 50  # scans from one whole map to the next, at least
     full_blocks_per_scan: Annotated[int, msgspec.Meta(ge=1)] = 250  # packed per scan: bounds the work of a whole map
 
@@ -42,6 +44,7 @@ class MapShare:
         self.config = config
         self._scans = 0
         self._map_ns = 0  # stamp of the first scan
+        self._more = False  # the last delta did not tell all
         self._walk: FullWalk | None = None
         self._shown = self._told = self._whole = 0  # version of the last cloud, delta, whole map
         self._next_whole = 0  # scan from which on
@@ -52,12 +55,15 @@ class MapShare:
             self._map_ns = stamp_ns
         if self._due(self.config.occupied_every) and len(voxels.changed_since(self._shown)):
             self._shown = voxels.version
-            points, log_odds = occupied_near(voxels, p_odom, self.config.occupied_radius_m)
+            radius_m = min(self.config.occupied_radius_m, voxels.config.max_range_m)
+            points, log_odds = occupied_near(voxels, p_odom, radius_m)
             yield OCCUPIED(OccupiedVoxels(stamp_ns=stamp_ns, points_odom=points, log_odds=log_odds))
-        if self._due(self.config.delta_every):
-            delta = delta_since(voxels, self._told, stamp_ns=stamp_ns, map_ns=self._map_ns)
+        if self._due(self.config.delta_every) or self._more:
+            delta = delta_since(
+                voxels, self._told, stamp_ns=stamp_ns, map_ns=self._map_ns, most=self.config.delta_blocks
+            )
             if delta is not None:
-                self._told = delta.version_to
+                self._told, self._more = delta.version_to, delta.version_to < voxels.version
                 yield MAP_DELTA(delta)
         if self.config.full_every:
             yield from self._advance(voxels, stamp_ns)

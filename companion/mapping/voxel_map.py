@@ -109,9 +109,14 @@ class VoxelMap:
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Positions (K, 3) of the blocks in which a voxel changed its class after `version`."""
-        count = self.blocks.count
-        warm = self.blocks.xyz[:count][self.blocks.changed_at[:count] > version]
-        return np.concatenate([warm, self.memory.changed_since(version)])
+        return self.changes_since(version)[0]
+
+    def changes_since(self, version: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """The same, and for each the version (K,) of its last change, or one between that and `version`."""
+        count, blocks = self.blocks.count, self.blocks
+        rows = np.flatnonzero(blocks.changed_at[:count] > version)
+        xyz, versions = self.memory.changes_since(version)
+        return np.concatenate([blocks.xyz[rows], xyz]), np.concatenate([blocks.changed_at[rows], versions])
 
     @property
     def memory_bytes(self) -> int:

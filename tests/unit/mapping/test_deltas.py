@@ -99,6 +99,43 @@ def test_a_delta_holds_the_changed_blocks_alone_and_nothing_gives_none():
     assert (delta.version_from, delta.version_to, delta.block_count) == (version, voxels.version, len(named))
 
 
+def test_a_large_change_is_told_in_pieces():
+    voxels, rng, mirror = VoxelMap(CONFIG), np.random.default_rng(4), MapMirror()
+    share = MapShare(ShareConfig(delta_every=5, delta_blocks=30, full_every=0, occupied_every=0))
+    sizes = []
+    for k in range(60):
+        if k < 30:
+            look(voxels, rng, stamp_ns=k)
+        if k == 12:  # as a correction: everything changes, in a few versions
+            count = voxels.blocks.count
+            for rows in np.array_split(np.arange(count), -(-count // 20)):
+                voxels.blocks.write(rows, -voxels.blocks.log_odds[rows], voxels.steps.lowest)
+        for output in share.after_scan(voxels, np.zeros(3), stamp_ns=k):
+            sizes.append(output.message.block_count)
+            assert mirror.take(output.message)
+    assert max(sizes) < 30 + 60 < voxels.block_count  # what one scan changes is not cut
+    assert mirror.version == voxels.version
+    assert classes(mirror.voxels) == classes(voxels)
+
+
+def test_the_end_of_a_whole_map_is_bounded_when_all_changed_meanwhile(monkeypatch):
+    monkeypatch.setattr("companion.mapping.deltas._AT_ONCE", 10)
+    voxels = looked(30)
+    walk, full, count, most = FullWalk(voxels, map_ns=0), None, 0, 0
+    for k in range(200):
+        full = walk.advance(voxels, blocks=20, stamp_ns=0)
+        most, count = max(most, walk._count - count), walk._count
+        if k in (2, 9):  # while it runs
+            rows = np.arange(voxels.blocks.count)
+            voxels.blocks.write(rows, -voxels.blocks.log_odds[rows], voxels.steps.lowest)
+        if full is not None:
+            break
+    assert most <= 20 + 10
+    mirror = MapMirror()
+    assert mirror.take(full)
+    assert classes(mirror.voxels) == classes(voxels)
+
+
 def test_the_same_map_gives_the_same_bytes_whatever_the_order_of_its_blocks():
     one = looked(30)
     other = VoxelMap(CONFIG)
