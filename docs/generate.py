@@ -138,16 +138,17 @@ def put_blocks(text: str, blocks: dict[str, str]) -> str:
 
 def mapping_bench_page(rows: list[MappingRow]) -> str:
     """The map beside its peers, from the rows of `companion bench mapping`."""
-    head = "| row | peer | ours, CPU ms | peer, CPU ms | ratio | target | aim | further figures |\n"
+    head = "| row | peer | ours, CPU ms | peer, CPU ms | ratio | rounds | target | aim | further figures |\n"
     lines = "\n".join("| " + " | ".join(cells(row)) + " |" for row in rows)
     load = max(row.machine_load for row in rows)
     notes = (DOCS / "reference/mapping-notes.txt").read_text(encoding="utf-8")
     return f"""{HEAD}# The map beside its peers
 
-Printed by `companion bench mapping`: peers and own code take turns in one process, CPU time, smallest of the
-rounds. {rows[0].cores} cores, up to {load:g} runnable processes beside (the ratio suffers from them).
+Printed by `companion bench mapping`: peers and own code take turns in one process, CPU time, smallest of as
+many rounds of each as the column says. {rows[0].cores} cores, up to {load:g} runnable processes beside (the ratio
+suffers from them).
 
-{head}|{"---|" * 8}
+{head}|{"---|" * 9}
 {lines}
 
 {notes}"""

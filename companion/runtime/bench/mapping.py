@@ -17,8 +17,9 @@ from companion.core.errors import InputError
 from companion.runtime.bench.mapping_cycle import time_cycle
 from companion.runtime.bench.mapping_field import FieldPeer, time_field
 from companion.runtime.bench.mapping_forest import DENSE, FLIGHT_SCANS, OPEN, Lidar, fly, make_forest
-from companion.runtime.bench.mapping_insert import agreement, time_insertion
+from companion.runtime.bench.mapping_insert import agreement, time_insertion, time_threads
 from companion.runtime.bench.mapping_memory import memory_figures
+from companion.runtime.bench.mapping_peers import RayPer
 from companion.runtime.bench.mapping_scans import PAIR, VELODYNE, Scan, pair_scans, velodyne_scans
 from companion.runtime.bench.mapping_thin import Thin, thin_recall
 
@@ -30,7 +31,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """How thoroughly to measure."""
 
     scans: int = FLIGHT_SCANS  # of the agreement with OctoMap
-    rounds: int = 3  # interleaved rounds, of which the smallest times count
+    rounds: int = 5  # of each of both, in turns, of which the smallest times count
     data: Path = Path("data")  # folder with the real scans
 
 
@@ -48,6 +49,7 @@ class MappingRow(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     met: bool | None = None  # the target
     aim_met: bool | None = None
     figures: dict[str, float] = {}
+    rounds: int = 0  # of each of both; 0: nothing was timed
     skipped: str = ""  # why there is no measurement
     machine_load: float = 0.0  # runnable processes in the minute before, of `cores`
     cores: int = 0
@@ -81,6 +83,7 @@ def bench_mapping(names: Sequence[str], options: Options) -> Iterator[MappingRow
 
 def _row(name: str, peer: str, figures: dict[str, float], goal: _Goal | None, load: float) -> MappingRow:
     ours_ms, peer_ms = figures.pop("ours_ms", None), figures.pop("peer_ms", None)
+    rounds = int(figures.pop("rounds", 0))
     ratio = peer_ms / ours_ms if ours_ms and peer_ms else None
     gauged = figures | ({} if ratio is None else {"ratio": ratio})
     row = MappingRow(
@@ -90,6 +93,7 @@ def _row(name: str, peer: str, figures: dict[str, float], goal: _Goal | None, lo
         peer_ms=_rounded(peer_ms),
         ratio=_rounded(ratio),
         figures={key: _rounded(value) or 0.0 for key, value in figures.items()},
+        rounds=rounds,
         machine_load=load,
         cores=os.cpu_count() or 1,
     )
@@ -111,21 +115,35 @@ def _forest_scans(lidar: Lidar, numbers: range) -> Iterator[Scan]:
     return fly(forest, lidar, numbers=numbers)
 
 
-def _insert_forest(lidar: Lidar, resolution_m: float, options: Options) -> tuple[str, dict[str, float]]:
-    scans = list(_forest_scans(lidar, range(_TIMED_FROM, _TIMED_FROM + _TIMED)))
-    return "OctoMap", time_insertion(scans, resolution_m, rounds=options.rounds)
+def _insert_forest(
+    lidar: Lidar, resolution_m: float, options: Options, *, ray_per: RayPer = "point"
+) -> tuple[str, dict[str, float]]:
+    figures = time_insertion(_few_scans(lidar), resolution_m, rounds=options.rounds, ray_per=ray_per)
+    return "OctoMap", figures
 
 
-def _insert_real(kind: str, resolution_m: float, options: Options) -> tuple[str, dict[str, float]]:
+def _few_scans(lidar: Lidar) -> list[Scan]:
+    return list(_forest_scans(lidar, range(_TIMED_FROM, _TIMED_FROM + _TIMED)))
+
+
+def _threads(lidar: Lidar, resolution_m: float, options: Options) -> tuple[str, dict[str, float]]:
+    return "", time_threads(_few_scans(lidar), resolution_m, rounds=options.rounds)
+
+
+def _insert_real(
+    kind: str, resolution_m: float, options: Options, *, ray_per: RayPer = "point"
+) -> tuple[str, dict[str, float]]:
     folder = options.data / kind
     if not folder.is_dir():
         raise FileNotFoundError(2, "no such folder", str(folder))
     scans = list(velodyne_scans(folder, count=_TIMED) if kind == VELODYNE else pair_scans(folder))
-    return "OctoMap", time_insertion(scans, resolution_m, rounds=options.rounds)
+    return "OctoMap", time_insertion(scans, resolution_m, rounds=options.rounds, ray_per=ray_per)
 
 
-def _agree(lidar: Lidar, resolution_m: float, options: Options) -> tuple[str, dict[str, float]]:
-    return "OctoMap", agreement(_forest_scans(lidar, range(options.scans)), resolution_m)
+def _agree(
+    lidar: Lidar, resolution_m: float, options: Options, *, ray_per: RayPer = "point"
+) -> tuple[str, dict[str, float]]:
+    return "OctoMap", agreement(_forest_scans(lidar, range(options.scans)), resolution_m, ray_per=ray_per)
 
 
 def _field(peer_name: FieldPeer, options: Options) -> tuple[str, dict[str, float]]:
@@ -134,8 +152,7 @@ def _field(peer_name: FieldPeer, options: Options) -> tuple[str, dict[str, float
 
 
 def _cycle(options: Options) -> tuple[str, dict[str, float]]:
-    scans = list(_forest_scans("os64", range(_TIMED_FROM, _TIMED_FROM + _TIMED)))
-    return "OctoMap's insertion alone", time_cycle(scans, rounds=options.rounds)
+    return "OctoMap's insertion alone", time_cycle(_few_scans("os64"), rounds=options.rounds)
 
 
 def _memory(_: Options) -> tuple[str, dict[str, float]]:
@@ -147,6 +164,7 @@ def _thin(kind: Thin, lidar: Lidar, resolution_m: float, _: Options) -> tuple[st
 
 
 _FOREST, _REAL = _Goal("ratio", 180, 300), _Goal("ratio", 35, 60)
+_AGREE, _THIN = _Goal("agreement", 0.9999), _Goal("flown_recall", 0.95)
 ROWS: dict[str, tuple[Measurement, _Goal | None]] = {
     "insert_os64_0.2": (partial(_insert_forest, "os64", 0.2), _FOREST),
     "insert_os64_0.1": (partial(_insert_forest, "os64", 0.1), _FOREST),
@@ -156,14 +174,20 @@ ROWS: dict[str, tuple[Measurement, _Goal | None]] = {
     "insert_hdl64_0.1": (partial(_insert_real, VELODYNE, 0.1), _REAL),
     "insert_pair_0.2": (partial(_insert_real, PAIR, 0.2), _REAL),
     "insert_pair_0.1": (partial(_insert_real, PAIR, 0.1), _REAL),
-    "agree_os64_0.2": (partial(_agree, "os64", 0.2), _Goal("agreement", 0.9999)),
-    "agree_mid360_0.2": (partial(_agree, "mid360", 0.2), _Goal("agreement", 0.9999)),
+    "insert_os64_0.2_end_voxel": (partial(_insert_forest, "os64", 0.2, ray_per="end_voxel"), None),
+    "insert_pair_0.2_end_voxel": (partial(_insert_real, PAIR, 0.2, ray_per="end_voxel"), None),
+    "threads_os64_0.2": (partial(_threads, "os64", 0.2), _Goal("same_map", 1)),
+    "threads_os64_0.1": (partial(_threads, "os64", 0.1), _Goal("same_map", 1)),
+    "agree_os64_0.2": (partial(_agree, "os64", 0.2), _AGREE),
+    "agree_mid360_0.2": (partial(_agree, "mid360", 0.2), _AGREE),
+    "agree_mid360_0.2_end_voxel": (partial(_agree, "mid360", 0.2, ray_per="end_voxel"), _AGREE),
     "field_edt": (partial(_field, "edt"), _Goal("ratio", 14, 25)),
     "field_scipy": (partial(_field, "scipy"), _Goal("ratio", 32, 55)),
     "cycle": (_cycle, None),
-    "thin_trunks": (partial(_thin, "trunks", "os64", 0.2), _Goal("recall", 0.95)),
-    "thin_branches": (partial(_thin, "branches", "os64", 0.2), _Goal("recall", 0.95)),
-    "thin_branches_mid360": (partial(_thin, "branches", "mid360", 0.2), _Goal("recall", 0.95)),
-    "thin_branches_0.1": (partial(_thin, "branches", "os64", 0.1), _Goal("recall", 0.95)),
+    "thin_trunks": (partial(_thin, "trunks", "os64", 0.2), _THIN),
+    "thin_trunks_mid360": (partial(_thin, "trunks", "mid360", 0.2), _THIN),
+    "thin_branches": (partial(_thin, "branches", "os64", 0.2), _THIN),
+    "thin_branches_mid360": (partial(_thin, "branches", "mid360", 0.2), _THIN),
+    "thin_branches_0.1": (partial(_thin, "branches", "os64", 0.1), _THIN),
     "memory": (_memory, _Goal("rss_growth_mb", 200, at_most=True)),
 }

@@ -38,7 +38,7 @@ def time_field(scans: list[Scan], peer_name: FieldPeer, *, rounds: int) -> dict[
     }
     best = alternate(works, rounds=_ROUNDS * rounds)
     error_m = _error_m(field.distance_to_occupied(states), empty, config.truncation_m)
-    return {**best, "max_error_m": error_m, "cells": float(empty.size)}
+    return {**best, "max_error_m": error_m, "cells": float(empty.size), "rounds": float(_ROUNDS * rounds)}
 
 
 def filled(scans: list[Scan]) -> VoxelMap:

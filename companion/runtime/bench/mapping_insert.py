@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
 
@@ -11,49 +13,77 @@ from numpy.typing import NDArray
 
 from companion.core.messages import Array
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
-from companion.runtime.bench.mapping_peers import OCTOMAP_MODEL, OctoMap, cpu_ms
+from companion.runtime.bench.mapping_peers import OCTOMAP_MODEL, OctoMap, RayPer, cpu_ms
 from companion.runtime.bench.mapping_scans import Scan
 
 RANGE_M = 30.0
-_OURS = 3  # maps of ours beside each tree: milliseconds are disturbed more easily than seconds
 _BLOCKS = 512  # blocks of voxels asked for at once
 _NEAR = np.array(list(product((-1, 0, 1), repeat=3)))
 
 
-def like_octomap(resolution_m: float) -> VoxelMapConfig:
+def like_octomap(resolution_m: float, ray_per: RayPer = "point") -> VoxelMapConfig:
     """Our map with OctoMap's sensor model."""
-    return VoxelMapConfig(resolution_m=resolution_m, max_range_m=RANGE_M, sensor=OCTOMAP_MODEL)
+    return VoxelMapConfig(resolution_m=resolution_m, max_range_m=RANGE_M, ray_per=ray_per, sensor=OCTOMAP_MODEL)
 
 
-def time_insertion(scans: list[Scan], resolution_m: float, *, rounds: int) -> dict[str, float]:
-    """CPU ms per scan of both, interleaved; the first scan, which fills an empty map, stands apart.
+def time_insertion(
+    scans: list[Scan], resolution_m: float, *, rounds: int, ray_per: RayPer = "point"
+) -> dict[str, float]:
+    """CPU ms per scan of both, in turns; the first scan, which fills an empty map, stands apart.
 
-    Each round fills new maps. Of each scan the smallest time over the rounds counts, then the mean over the scans.
+    Each round fills a new map and a new tree. Of each scan the smallest time over the rounds counts, then the
+    mean over the scans.
     """
-    ours, theirs = np.full(len(scans), np.inf), np.full(len(scans), np.inf)
+    taken = np.full((2, len(scans)), np.inf)
     for _ in range(rounds):
-        maps = [VoxelMap(like_octomap(resolution_m)) for _ in range(_OURS)]
-        tree = OctoMap(resolution_m, RANGE_M)
+        voxels, tree = VoxelMap(like_octomap(resolution_m, ray_per)), OctoMap(resolution_m, RANGE_M, ray_per=ray_per)
         for k, scan in enumerate(scans):
-            taken = [cpu_ms(partial(scan.into, voxels)) for voxels in maps]
-            ours[k] = min(ours[k], *taken)
-            theirs[k] = min(theirs[k], cpu_ms(tree.insertion(scan)))
+            works = (partial(scan.into, voxels), tree.insertion(scan))
+            taken[:, k] = np.minimum(taken[:, k], [cpu_ms(work) for work in works])
+    ours, theirs = taken
     return {
         "ours_ms": float(ours[1:].mean()),
         "peer_ms": float(theirs[1:].mean()),
         "first_ours_ms": float(ours[0]),
         "first_peer_ms": float(theirs[0]),
         "returns": float(np.mean([len(s.points_body) for s in scans[1:]])),
+        "rounds": float(rounds),
     }
 
 
-def agreement(scans: Iterable[Scan], resolution_m: float) -> dict[str, float]:
+def time_threads(scans: list[Scan], resolution_m: float, *, rounds: int) -> dict[str, float]:
+    """Wall ms per scan of one thread and of two, in turns, and 1 if both give the same map.
+
+    As `time_insertion` otherwise. What a second thread gains depends on whether a core is free for it.
+    """
+    taken = np.full((2, len(scans)), np.inf)
+    with ThreadPoolExecutor(2) as threads:
+        for _ in range(rounds):
+            config = like_octomap(resolution_m)
+            maps = VoxelMap(config), VoxelMap(config, map_pool=threads.map)
+            for k, scan in enumerate(scans):
+                taken[:, k] = np.minimum(taken[:, k], [_wall_ms(partial(scan.into, voxels)) for voxels in maps])
+    one, two = (voxels.to_arrays() for voxels in maps)
+    one_ms, two_ms = taken[:, 1:].mean(axis=1)
+    same = all(np.array_equal(one[name], two[name]) for name in one)
+    figures = {"one_thread_wall_ms": float(one_ms), "two_threads_wall_ms": float(two_ms)}
+    return figures | {"same_map": float(same), "rounds": float(rounds)}
+
+
+def _wall_ms(work: Callable[[], object]) -> float:
+    started = time.perf_counter_ns()
+    work()
+    return (time.perf_counter_ns() - started) * 1e-6
+
+
+def agreement(scans: Iterable[Scan], resolution_m: float, *, ray_per: RayPer = "point") -> dict[str, float]:
     """Both maps after all scans, over the voxels that either knows.
 
     `agreement`: same class; `free_recall`, `occupied_recall`: share of OctoMap's that are ours,
     too; `occupied_precision`: share of our occupied that are occupied in OctoMap.
     """
-    voxels, tree, count = VoxelMap(like_octomap(resolution_m)), OctoMap(resolution_m, RANGE_M), 0
+    voxels, tree = VoxelMap(like_octomap(resolution_m, ray_per)), OctoMap(resolution_m, RANGE_M, ray_per=ray_per)
+    count = 0
     for scan in scans:
         scan.into(voxels)
         tree.insertion(scan)()

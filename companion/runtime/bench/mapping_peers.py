@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from companion.core.messages import Array
 from companion.mapping.sensor_model import SensorModel
 from companion.runtime.bench.mapping_scans import Scan
 
+RayPer = Literal["point", "end_voxel"]
 OCTOMAP_MODEL = SensorModel(hit=0.7, miss=0.4, lowest=0.1192, highest=0.971)  # its own defaults
 
 
@@ -29,7 +30,8 @@ def peer(name: str) -> Any:
 class OctoMap:
     """OctoMap 1.10 through pyoctomap, with its own sensor model."""
 
-    def __init__(self, resolution_m: float, range_m: float) -> None:
+    def __init__(self, resolution_m: float, range_m: float, *, ray_per: RayPer = "point") -> None:
+        self._discretize = ray_per == "end_voxel"
         self._tree = peer("pyoctomap").OcTree(resolution_m)
         self._range_m = range_m
         self._tree.setProbHit(OCTOMAP_MODEL.hit)
@@ -40,7 +42,7 @@ class OctoMap:
     def insertion(self, scan: Scan) -> Callable[[], None]:
         """Work that inserts the scan: the points are brought into its form beforehand."""
         points, origin = scan.points_odom, scan.p_odom.copy()
-        return lambda: self._tree.insertPointCloud(points, origin, self._range_m, False)
+        return lambda: self._tree.insertPointCloud(points, origin, self._range_m, False, self._discretize)
 
     def classes(self, centers_odom: Array) -> NDArray[np.uint8]:
         """0 unknown, 1 free, 2 occupied (N,) at voxel centres (N, 3), m."""
