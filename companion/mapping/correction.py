@@ -19,11 +19,11 @@ import numpy as np
 
 from companion.mapping.cold_region import unpack
 from companion.mapping.comparison import Comparison, any_known
-from companion.mapping.evidence import Levels, added
+from companion.mapping.evidence import added
 from companion.mapping.moved_blocks import MovedBlocks
 from companion.mapping.pose_track import PoseCorrector, PoseShift
 from companion.mapping.sensor_model import UNKNOWN
-from companion.mapping.submaps import Submap, SubmapConfig, Submaps
+from companion.mapping.submaps import Evidence, Submap, SubmapConfig, Submaps
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
 
 _LEAP = 1 << 40  # versions: more than insertion makes while a correction runs
@@ -82,7 +82,7 @@ class Correction:
         return any(self._shift(submap) is not _STAY for submap in self._submaps.closed)
 
     def advance(self) -> Corrected | None:
-        """One bounded step; None: there is more to do."""
+        """One bounded step; None: there is more to do. Raises OSError: a stretch cannot be read any more."""
         left = self.config.blocks_per_scan
         self._submaps.joining = False  # stretches are counted
         self._keep_small()
@@ -114,11 +114,11 @@ class Correction:
         self._loaded += 1
         return region.count
 
-    def _open(self, submap: Submap, values: Levels | None = None) -> None:
+    def _open(self, submap: Submap, evidence: Evidence | None = None) -> None:
         """Move a stretch; its blocks are added by `_add`."""
         shift = self._shift(submap)
-        evidence = submap.values(self._voxels.steps) if values is None else values
-        self._now = MovedBlocks(submap.xyz, evidence, shift, self._voxels.resolution_m)
+        xyz, values = evidence or self._submaps.evidence(submap)
+        self._now = MovedBlocks(xyz, values, shift, self._voxels.resolution_m)
         self._first, self._last_ns = 0, submap.last_ns
         self._moved += shift is not _STAY
         self._opened += 1

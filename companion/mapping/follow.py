@@ -35,6 +35,7 @@ class MapFollower:
         self.config = config
         self.voxels = voxels
         self.submaps = Submaps(config.submaps, voxels) if config.enabled else None
+        self.failure: str | None = None  # why no correction is possible any more
         self.skipped = 0  # corrections that were no poses, or of no flight
         self._running: Correction | None = None
         self._waiting: PoseCorrector | None = None
@@ -43,7 +44,7 @@ class MapFollower:
     @property
     def watch(self) -> Watch | None:
         """The argument of that name of `VoxelMap.insert`."""
-        return self.submaps.watch if self.submaps else None
+        return self.submaps.watch if self.submaps and not self.failure else None
 
     @property
     def busy(self) -> bool:
@@ -52,7 +53,7 @@ class MapFollower:
 
     def take(self, corrections: PoseCorrections) -> None:
         """Begin with the next scan, or when the running correction is done."""
-        if self.submaps is None or self.submaps.track.count == 0:
+        if self.submaps is None or self.failure or self.submaps.track.count == 0:
             self.skipped += 1
             return
         try:
@@ -64,15 +65,19 @@ class MapFollower:
 
     def after_scan(self, stamp_ns: int, p_odom: Array, q_odom_body: Array) -> Corrected | None:
         """A scan is in the map: note its pose, and do a step; returns what was done when it is done."""
-        if self.submaps is None:
+        if self._replaced and not self._replaced.let_go(_LET_GO):
+            self._replaced = None
+        if self.submaps is None or self.failure:
             return None
         self.submaps.after_scan(stamp_ns, p_odom, q_odom_body)
         if self._running is None:
             self._running = self._begin()
-        if self._replaced and not self._replaced.let_go(_LET_GO):
-            self._replaced = None
         running = self._running
-        done = running.advance() if running else None
+        try:
+            done = running.advance() if running else None
+        except OSError as error:  # the map stays as it is, and goes on
+            self.failure, done, self._running = str(error), None, None
+            self._replaced = running.replaced if running else None
         if running and done:
             self._running, self._replaced = None, running.replaced
         return done

@@ -63,7 +63,7 @@ class MappingNode(Node):
         self._decay = Decay(config.decay)
         self._share = MapShare(config.share)
         self._newest_ns = -1
-        self._refused = False
+        self._said: list[str] = []
         self._compile()
 
     @on(REGISTERED)
@@ -109,12 +109,12 @@ class MappingNode(Node):
             yield WHY(Why(stamp_ns=scan.stamp_ns, node="mapping", what=what, because="past poses were corrected"))
 
     def _tell_of_shelf(self, stamp_ns: int) -> Outputs:
-        """Once: that far blocks stay in memory after all."""
-        refusal = self.voxels.memory.cold.shelves.refusal
-        if refusal and not self._refused:
-            self._refused = True
-            what = "keeps far blocks of the map in memory"
-            yield WHY(Why(stamp_ns=stamp_ns, node="mapping", what=what, because=f"they cannot be written: {refusal}"))
+        """Once: that far blocks stay in memory after all, that the map cannot be corrected any more."""
+        refusal, failure = self.voxels.memory.cold.shelves.refusal, self.follower.failure
+        for what, why in (("keeps far blocks of the map in memory", refusal), ("corrects the map no more", failure)):
+            if why and what not in self._said:
+                self._said.append(what)
+                yield WHY(Why(stamp_ns=stamp_ns, node="mapping", what=what, because=why))
 
     def _status(self, stamp_ns: int) -> MapStatus:
         voxels = self.voxels

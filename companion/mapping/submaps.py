@@ -7,6 +7,7 @@ scans and cast their rays again would cost 30 times as much as moving what they 
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -23,9 +24,13 @@ from companion.mapping.evidence import Levels, PackedEvidence, added, evidence, 
 from companion.mapping.pose_track import PoseTrack
 from companion.mapping.rays import CELLS, WORDS, ScanBits
 from companion.mapping.sensor_model import Steps
+from companion.mapping.shelf import Shelves
 from companion.mapping.voxel_map import VoxelMap
 
 _GROWTH = 4096  # blocks
+_PART_BYTES = 300  # of the objects around a part's bytes
+Evidence = tuple[NDArray[np.int32], Levels]
+"""Positions (N, 3) of blocks, and what their cells (N, 512) got, log-odds steps; UNKNOWN: no ray."""
 
 
 class SubmapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -43,18 +48,22 @@ class Submap:
     anchor_ns: int  # the scan in the middle of its way: where that goes, all of it goes
     last_ns: int  # newest scan
     length_m: float
-    xyz: NDArray[np.int32]  # blocks (N, 3)
-    parts: list[PackedEvidence] = field(default_factory=list)
-
-    def values(self, steps: Steps) -> Levels:
-        """Evidence (N, 512) of the blocks, log-odds steps; UNKNOWN: none."""
-        parts = [unpack(part, steps) for part in self.parts]
-        return np.concatenate([np.empty((0, CELLS), np.int8), *parts])
+    blocks: int
+    parts: list[_Part] = field(default_factory=list)
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of memory."""
-        return self.xyz.nbytes + sum(part.memory_bytes for part in self.parts)
+        """Bytes of memory, estimated, as if nothing lay on a shelf."""
+        return sum(sum(part.sizes) + _PART_BYTES for part in self.parts)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Some blocks of a stretch: their positions and evidence, packed, on the shelves."""
+
+    number: int
+    sizes: tuple[int, int, int]  # bytes of the positions, codes and list
+    count: int
 
 
 class Submaps:
@@ -64,7 +73,8 @@ class Submaps:
     >>> voxels.insert(points, ..., stamp_ns=stamp_ns, watch=submaps.watch)
     >>> submaps.after_scan(stamp_ns, p_odom, q_odom_body)
 
-    `closed` are at rest, in order of time; `loaded` are regions of a loaded map as it was.
+    `closed` are at rest, in order of time, where the map has its cold blocks; `loaded` are regions of a
+    loaded map as it was.
     """
 
     def __init__(self, config: SubmapConfig, voxels: VoxelMap) -> None:
@@ -74,7 +84,8 @@ class Submaps:
         self.closed: list[Submap] = []
         self.loaded = _loaded(voxels)
         self.joining = True  # stretches may be joined
-        self._closing: list[tuple[Submap, Levels]] = []  # with the part that is not packed yet
+        self.shelves = Shelves(voxels.shelf if voxels.config.memory.spill else None)
+        self._closing: list[tuple[Submap, Evidence]] = []  # with the part that is not packed yet
         self._anchor_ns: int | None = None  # None: no scan yet
         self._at: Array | None = None  # where the newest scan of the open stretch was
         self._length_m = 0.0
@@ -82,11 +93,18 @@ class Submaps:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of submaps at rest and of the stretch that is open."""
+        """Bytes in memory of submaps at rest and of the stretch that is open."""
         rest = sum(submap.memory_bytes for submap in self.closed) + self.track.memory_bytes
         rest += sum(region.memory_bytes for _, region in self.loaded)
-        waiting = sum(values.nbytes for _, values in self._closing)
-        return rest + waiting + self._before.memory_bytes + self._crossed.nbytes + self._hit.nbytes
+        waiting = sum(xyz.nbytes + values.nbytes for _, (xyz, values) in self._closing)
+        return (
+            rest
+            - self.shelves.outside_bytes
+            + waiting
+            + self._before.memory_bytes
+            + self._crossed.nbytes
+            + self._hit.nbytes
+        )
 
     @property
     def settled(self) -> bool:
@@ -126,7 +144,17 @@ class Submaps:
             self.close()
         self.pack_some()
 
-    def close(self) -> tuple[Submap, Levels] | None:
+    def evidence(self, submap: Submap) -> Evidence:
+        """What a stretch at rest saw. Raises OSError: it cannot be read any more."""
+        xyz, values = [np.empty((0, 3), np.int32)], [np.empty((0, CELLS), np.int8)]
+        for part in submap.parts:
+            data, (a, b, c) = self.shelves.get(part.number), part.sizes
+            xyz.append(np.frombuffer(zlib.decompress(data[:a]), np.int32).reshape(-1, 3))
+            packed = PackedEvidence(part.count, data[a : a + b], data[a + b : a + b + c])
+            values.append(unpack(packed, self.voxels.steps))
+        return np.concatenate(xyz), np.concatenate(values)
+
+    def close(self) -> tuple[Submap, Evidence] | None:
         """End the open stretch and begin another; returns it with its evidence, not packed yet."""
         if self._anchor_ns is None:
             return None
@@ -135,10 +163,10 @@ class Submaps:
         after = voxels.memory.log_odds_of(xyz.astype(np.int64))
         bits = (self._crossed[:count], self._hit[:count])
         values = evidence(self._before.log_odds[:count], after, bits, voxels.steps)
-        submap = Submap(self._anchor_ns, self.track.newest_ns, self._length_m, xyz)
-        self._closing.append((submap, values))
+        submap = Submap(self._anchor_ns, self.track.newest_ns, self._length_m, count)
+        self._closing.append((submap, (xyz, values)))
         self._begin()
-        return submap, values
+        return submap, (xyz, values)
 
     def _begin(self) -> None:
         self._before = BlockStore()
@@ -153,10 +181,10 @@ class Submaps:
         """Pack a bounded number of blocks of the oldest stretch that has ended."""
         if not self._closing:
             return
-        submap, values = self._closing[0]
+        submap, (xyz, values) = self._closing[0]
         count = self.config.pack_blocks_per_scan
-        submap.parts.append(pack(values[:count], self.voxels.steps))
-        self._closing[0] = (submap, values[count:])
+        submap.parts.append(self._rest(xyz[:count], values[:count]))
+        self._closing[0] = (submap, (xyz[count:], values[count:]))
         if len(values) <= count:
             self.closed.append(self._closing.pop(0)[0])
             if self.joining and sum(part.memory_bytes for part in self.closed) > 1e6 * self.config.budget_mb:
@@ -167,7 +195,24 @@ class Submaps:
         if len(self.closed) < 2:
             return
         k = min(range(len(self.closed) - 1), key=lambda k: self.closed[k].length_m + self.closed[k + 1].length_m)
-        self.closed[k : k + 2] = [_joined(self.closed[k], self.closed[k + 1], self.voxels.steps)]
+        a, b = self.closed[k : k + 2]
+        try:
+            xyz, values = _joined(self.evidence(a), self.evidence(b), self.voxels.steps)
+        except OSError:  # the next correction will find that, too
+            self.joining = False
+            return
+        longer = a if a.length_m >= b.length_m else b
+        joined = Submap(longer.anchor_ns, b.last_ns, a.length_m + b.length_m, len(xyz), [self._rest(xyz, values)])
+        self.closed[k : k + 2] = [joined]
+        for part in (*a.parts, *b.parts):
+            self.shelves.drop(part.number)
+
+    def _rest(self, xyz: NDArray[np.int32], values: Levels) -> _Part:
+        """Put blocks and their evidence by."""
+        places, packed = zlib.compress(np.ascontiguousarray(xyz).tobytes(), 1), pack(values, self.voxels.steps)
+        data = (places, packed.codes, packed.listed)
+        sizes = (len(places), len(packed.codes), len(packed.listed))
+        return _Part(self.shelves.put(b"".join(data)), sizes, len(values))
 
 
 def _loaded(voxels: VoxelMap) -> list[tuple[int, ColdRegion]]:
@@ -181,24 +226,16 @@ def _loaded(voxels: VoxelMap) -> list[tuple[int, ColdRegion]]:
     return regions
 
 
-def _joined(a: Submap, b: Submap, steps: Steps) -> Submap:
+def _joined(a: Evidence, b: Evidence, steps: Steps) -> Evidence:
     """Both as one rigid piece."""
-    both, first = BlockStore(), a.values(steps)
-    both.add(a.xyz, first, steps.lowest, held=False)
-    rows = both.rows_of(b.xyz.astype(np.int64))
-    known, values = rows >= 0, b.values(steps)
+    both = BlockStore()
+    both.add(*a, steps.lowest, held=False)
+    (xyz, values), rows = b, both.rows_of(b[0].astype(np.int64))
+    known = rows >= 0
     widest = steps.highest - steps.lowest
     both.write(rows[known], added(both.log_odds[rows[known]], values[known], (-widest, widest)), steps.lowest)
-    both.add(b.xyz[~known], values[~known], steps.lowest, held=False)
-    longer = a if a.length_m >= b.length_m else b
-    count = both.count
-    return Submap(
-        longer.anchor_ns,
-        b.last_ns,
-        a.length_m + b.length_m,
-        both.xyz[:count].copy(),
-        [pack(both.log_odds[:count], steps)],
-    )
+    both.add(xyz[~known], values[~known], steps.lowest, held=False)
+    return both.xyz[: both.count].copy(), both.log_odds[: both.count].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -9,14 +9,17 @@ from companion.core.messages import PoseCorrections, RegisteredScan
 from companion.core.rig import Rig
 from companion.core.topics import CORRECTIONS, REGISTERED, WHY
 from companion.mapping.correction import Correction, CorrectionConfig
+from companion.mapping.deltas import delta_since
 from companion.mapping.distance_field import FieldConfig
 from companion.mapping.follow import FollowConfig, MapFollower
 from companion.mapping.memory import MemoryConfig
+from companion.mapping.mirror import MapMirror
 from companion.mapping.node import MappingConfig, MappingNode
 from companion.mapping.pose_track import PoseCorrector
 from companion.mapping.submaps import SubmapConfig, Submaps
 from companion.mapping.voxel_map import VoxelMap
 from tests.unit.mapping.corridor import CONFIG, STEP_NS, TRUE, anchored, drifted, fly, quaternions, scan
+from tests.unit.mapping.failing_shelf import FailingShelf
 
 DEFAULT = CorrectionConfig()
 SHORT = SubmapConfig(length_m=5.0)
@@ -149,7 +152,7 @@ def test_each_step_is_bounded_and_their_size_does_not_show_in_the_map(blocks_per
     done, steps = corrected(voxels, kept, keys=keys, config=CorrectionConfig(blocks_per_scan=blocks_per_scan))
     corrected(others, again, keys=keys)
     assert same(voxels, others)
-    largest_stretch = max(len(submap.xyz) for submap in kept.closed)
+    largest_stretch = max(submap.blocks for submap in kept.closed)
     assert steps >= (done.work - 8 * largest_stretch) / blocks_per_scan  # the open stretch is added in the last step
 
 
@@ -272,6 +275,65 @@ def test_a_second_correction_waits_for_the_first_and_has_the_last_word():
     assert (len(done), len(done_twice)) == (1, 2)
     assert found(once, twice, 0.21) > 0.99
     assert found(twice, once, 0.21) > 0.99
+
+
+def test_mirrors_follow_corrections_that_run_beside_scans():
+    """All that differs after the last step is told, in pieces, be it seen before, during or after the comparison."""
+    correction = CorrectionConfig(blocks_per_scan=300)
+    follower = MapFollower(FollowConfig(submaps=SHORT, correction=correction), VoxelMap(CONFIG))
+    voxels, mirror, done, known = follower.voxels, MapMirror(), [], [0]
+
+    def tell():
+        delta = delta_since(voxels, known[0], stamp_ns=0, map_ns=0, most=300)
+        if delta is not None:
+            known[0] = delta.version_to
+            assert mirror.take(delta)
+
+    def after(stamp_ns, p, q):
+        if stamp_ns in (60 * STEP_NS, 100 * STEP_NS):
+            follower.take(message(keys=KEYS[stamp_ns // STEP_NS > KEYS]))
+        done.append(follower.after_scan(stamp_ns, p, q))
+        tell()
+
+    fly(voxels, follower, DRIFTED, range(MANY), after)
+    while known[0] < voxels.version:
+        tell()
+    assert [d.changed > 600 for d in done if d] == [True, True]
+    ours, theirs = classes(voxels), classes(mirror.voxels)
+    assert {xyz: kind for xyz, kind in ours.items() if any(kind)} == {x: k for x, k in theirs.items() if any(k)}
+
+
+def follow_with(shelf):
+    voxels = VoxelMap(CONFIG, shelf=shelf)
+    follower = MapFollower(FollowConfig(submaps=SHORT), voxels)
+
+    def after(stamp_ns, p, q):
+        if stamp_ns == 100 * STEP_NS:
+            follower.take(message(keys=KEYS[KEYS < 100]))
+        follower.after_scan(stamp_ns, p, q)
+
+    fly(voxels, follower, DRIFTED, range(MANY), after)
+    return follower
+
+
+def test_stretches_on_a_shelf_give_the_same_map_and_take_no_memory():
+    inside, shelf = follow_with(None), FailingShelf()
+    outside = follow_with(shelf)
+    assert same(inside.voxels, outside.voxels)
+    assert inside.submaps.shelves.inside_bytes == outside.submaps.shelves.outside_bytes > 0
+    saved = inside.submaps.memory_bytes - outside.submaps.memory_bytes
+    assert saved == outside.submaps.shelves.outside_bytes
+    assert inside.failure is None is outside.failure
+
+
+def test_a_stretch_that_cannot_be_read_ends_corrections_and_leaves_the_map_alone():
+    uncorrected, _ = flown()
+    follower = follow_with(FailingShelf(breaks=0))
+    assert "Input/output error" in follower.failure
+    assert not follower.busy
+    assert same(follower.voxels, uncorrected)
+    follower.take(message())
+    assert follower.skipped == 1
 
 
 @pytest.mark.parametrize(

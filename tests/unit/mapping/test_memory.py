@@ -26,6 +26,7 @@ from companion.mapping.deltas import unpack as records_from
 from companion.mapping.memory import MemoryConfig
 from companion.mapping.mirror import MapMirror
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from tests.unit.mapping.failing_shelf import FailingShelf
 
 NEVER = MemoryConfig(keep_m=1e5)
 EAGER = MemoryConfig(keep_m=0.0, regions_per_scan=4)
@@ -202,32 +203,9 @@ def test_only_blocks_in_which_something_stands_have_marks():
     assert not table.bits[free].any()
 
 
-class Failing:
-    """A shelf that takes `room` bytes, then refuses, and from get number `breaks` on cannot read."""
-
-    def __init__(self, room=10**9, breaks=10**9):
-        self.room, self.breaks, self.kept, self.gets = room, breaks, {}, 0
-
-    def put(self, data):
-        if len(data) > self.room:
-            raise OSError(28, "No space left on device")
-        self.room -= len(data)
-        self.kept[len(self.kept)] = data
-        return len(self.kept) - 1
-
-    def get(self, number):
-        self.gets += 1
-        if self.gets > self.breaks:
-            raise OSError(5, "Input/output error")
-        return self.kept[number]
-
-    def drop(self, number):
-        self.kept[number] = None
-
-
 @pytest.mark.parametrize("room", [0, 20_000, 10**9])
 def test_a_shelf_changes_nothing_of_the_map_even_when_it_is_full(room):
-    shelf = Failing(room)
+    shelf = FailingShelf(room)
     plain, lean = there_and_back(EAGER), there_and_back(EAGER, shelf=shelf)
     assert digest(plain) == digest(lean)
     assert lean.memory_bytes == plain.memory_bytes
@@ -241,14 +219,14 @@ def test_a_shelf_changes_nothing_of_the_map_even_when_it_is_full(room):
 
 
 def test_without_spill_nothing_goes_on_a_shelf():
-    shelf = Failing()
+    shelf = FailingShelf()
     lean = there_and_back(MemoryConfig(keep_m=0.0, regions_per_scan=4, spill=False), shelf=shelf)
     assert not shelf.kept
     assert lean.memory.cold_regions > 0 == lean.memory.spilled_bytes
 
 
 def test_what_cannot_be_read_again_is_forgotten_counted_and_told():
-    plain, lean = there_and_back(NEVER), there_and_back(EAGER, shelf=Failing(breaks=30))
+    plain, lean = there_and_back(NEVER), there_and_back(EAGER, shelf=FailingShelf(breaks=30))
     wanted, parts = whole(plain), whole(lean)
     lost = lean.memory.cold.lost_blocks
     assert 0 < lost == lean.memory.forgotten_blocks
