@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.core.messages import Array
 from companion.mapping.voxel_map import OCCUPIED_CELL, VoxelMap, VoxelMapConfig
@@ -25,6 +26,7 @@ from companion.runtime.bench.mapping_peers import OctoMap
 from companion.runtime.bench.mapping_scans import Scan
 
 Thin = Literal["trunks", "branches"]
+_Classes = Callable[[Array], NDArray[np.uint8]]
 _THINGS = 250
 _AHEAD_M, _ASIDE_M, _CLEAR_M = 24.0, 12.0, 1.5  # where they stand, and how far from the way
 _TRUNK_RADIUS_M, _BRANCH_RADIUS_M = 0.03, 0.01
@@ -68,23 +70,23 @@ def thin_recall(kind: Thin, lidar: Lidar, resolution_m: float) -> dict[str, floa
     scenery = thin_world(kind, seed=11)
     scans = thin_scans(scenery, lidar, count=_FLOWN)
     last, first = scans[-_LAST:], scenery.first[kind]
+    fresh, flown = _filled(last, resolution_m), _filled(scans, resolution_m)
     figures: dict[str, float] = {}
-    for name, taken, asked in (("", last, last), ("flown_", scans, last), ("kept_", scans, scans)):
+    for name, maps, asked in (("", fresh, last), ("flown_", flown, last), ("kept_", flown, scans)):
         seen = _seen(asked, first, resolution_m)
-        ours, theirs = _occupied(taken, seen, resolution_m)
+        ours, theirs = (float(np.mean(classes(seen) == OCCUPIED_CELL)) for classes in maps)
         figures |= {f"{name}recall": ours, f"octomap_{name}recall": theirs, f"{name}seen_voxels": float(len(seen))}
     return figures
 
 
-def _occupied(scans: Sequence[Scan], centers: Array, resolution_m: float) -> tuple[float, float]:
-    """Share of the voxels that are occupied after the scans, ours and OctoMap's."""
+def _filled(scans: Sequence[Scan], resolution_m: float) -> tuple[_Classes, _Classes]:
+    """What tells the classes of voxels in a map of all scans, ours and OctoMap's."""
     voxels = VoxelMap(VoxelMapConfig(resolution_m=resolution_m, max_range_m=RANGE_M))
     tree = OctoMap(resolution_m, RANGE_M)
     for scan in scans:
         scan.into(voxels)
         tree.insertion(scan)()
-    classes = voxels.classify(centers), tree.classes(centers)
-    return float(np.mean(classes[0] == OCCUPIED_CELL)), float(np.mean(classes[1] == OCCUPIED_CELL))
+    return voxels.classify, tree.classes
 
 
 def _seen(scans: Sequence[Scan], first: int, resolution_m: float) -> Array:
