@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from companion.core.messages import Array
 from companion.planning.grid import JUMP_UNIT, segment_free
-from companion.planning.lattice.open_list import FREE, RING, ROOM, USED, pop, push
+from companion.planning.heap import pop, push
 from companion.planning.tree import COST, NEVER, gap
 
 COARSEST = 3  # level n: lattice points 2^n cells apart
@@ -28,7 +28,7 @@ State = Literal["open", "found", "exhausted"]
 _PARENT, _VIA, _CELL = range(3)  # columns of links; nodes count from 1, 0: none
 _NODES, _LEFT, _LAST = range(3)  # of counts: nodes used, expansions left, node that sees the goal
 _OPEN, _FOUND, _EXHAUSTED, _FULL = range(4)
-_START = 1
+_START, _ROOM = 1, 32  # more than a node has neighbours
 _JUMPS = np.array([1.0, 3.0, 4.5]) * JUMP_UNIT  # least free jump around a point of level 1, 2, 3
 # Where in its cell a lattice point lies. Off the centre, so that no diagonal step runs exactly through a corner.
 _PLACE = np.array([0.511, 0.483, 0.507])
@@ -41,7 +41,7 @@ class LazyTheta:
         self._index = np.zeros(0, np.int32)  # node of each cell
         self._resize(4096)
         self._counts = np.array([1, 0, 0])
-        self._open = (np.empty(RING, np.int32), np.empty((8192, 2), np.int32), np.zeros(4, np.int64))
+        self._heap = (np.empty(8192), np.empty(8192, np.int32), np.zeros(1, np.int64))
 
     def _resize(self, nodes: int) -> None:
         self._nodes, self._links = np.zeros((nodes, 4)), np.zeros((nodes, 3), np.int32)
@@ -58,11 +58,8 @@ class LazyTheta:
         self._forget(steps.size)
         self._steps, self._ends = steps, np.ascontiguousarray(ends, np.float64)
         self._levels, self._bound = levels, (weight, most)
-        heads, _, ring = self._open
-        heads.fill(-1)
-        ring[:] = 0
-        ring[FREE] = -1
-        plant(steps, self._ends, weight, self._tree, self._open, self._counts)
+        self._heap[2][0] = 0
+        plant(steps, self._ends, weight, self._tree, self._heap, self._counts)
 
     @property
     def _tree(self) -> tuple[NDArray[np.int32], Array, NDArray[np.int32], NDArray[np.bool_]]:
@@ -81,20 +78,19 @@ class LazyTheta:
         self._counts[_LEFT] = expansions
         while True:
             world = (self._steps, self._ends, self._levels, self._bound)
-            code = expand(*world, self._tree, self._open, self._counts)
+            code = expand(*world, self._tree, self._heap, self._counts)
             if code != _FULL:
                 return ("open", "found", "exhausted")[code]
             self._grow()
 
     def _grow(self) -> None:
-        used, (heads, pool, ring) = int(self._counts[_NODES]), self._open
-        if used + ROOM > len(self._nodes):
+        used, (keys, items, size) = int(self._counts[_NODES]), self._heap
+        if used + _ROOM > len(self._nodes):
             old = self._nodes, self._links, self._closed
             self._resize(2 * len(self._nodes))
-            for new, kept in zip((self._nodes, self._links, self._closed), old, strict=True):
-                new[:used] = kept[:used]
-        if ring[USED] + ROOM > len(pool):
-            self._open = heads, np.concatenate([pool, np.empty_like(pool)]), ring
+            self._nodes[:used], self._links[:used], self._closed[:used] = (array[:used] for array in old)
+        if size[0] + _ROOM > len(keys):
+            self._heap = np.resize(keys, 2 * len(keys)), np.resize(items, 2 * len(items)), size
 
     @property
     def expanded(self) -> int:
@@ -111,7 +107,7 @@ class LazyTheta:
 
 
 @njit(cache=True, nogil=True)
-def plant(steps, ends, weight, tree, queue, counts):  # type: ignore[no-untyped-def]
+def plant(steps, ends, weight, tree, heap, counts):  # type: ignore[no-untyped-def]
     """Make the start the only node, and open."""
     index, nodes, links, closed = tree
     for k in range(3):
@@ -122,23 +118,23 @@ def plant(steps, ends, weight, tree, queue, counts):  # type: ignore[no-untyped-
     links[_START, _PARENT], links[_START, _VIA], links[_START, _CELL] = 0, 0, cell
     closed[_START] = False
     counts[_NODES] = _START + 1
-    push(queue[0], queue[1], queue[2], _START, weight * gap(ends, 0, ends, 1))
+    push(heap[0], heap[1], heap[2], weight * gap(ends, 0, ends, 1), _START)
 
 
 @njit(cache=True, nogil=True)
-def expand(steps, ends, levels, bound, tree, queue, counts):  # type: ignore[no-untyped-def]
+def expand(steps, ends, levels, bound, tree, heap, counts):  # type: ignore[no-untyped-def]
     """Expand nodes until the goal is in sight, none is left, memory is full or counts says stop.
 
-    index (V,) node of a cell; nodes (C, 4) x, y, z, cost; links (C, 3); closed (C,); queue as in `open_list`.
+    index (V,) node of a cell; nodes (C, 4) x, y, z, cost; links (C, 3); closed (C,); heap as in `heap`.
     """
     _, nodes, _, closed = tree
-    heads, pool, ring = queue
+    keys, items, size = heap
     while counts[_LEFT] > 0:
-        if counts[_NODES] + ROOM > nodes.shape[0] or ring[USED] + ROOM > pool.shape[0]:
+        if counts[_NODES] + _ROOM > nodes.shape[0] or size[0] + _ROOM > keys.shape[0]:
             return _FULL
-        v = pop(heads, pool, ring, bound[1] if bound[0] <= 1.0 else NEVER)
-        if v < 0:
+        if size[0] == 0:
             return _EXHAUSTED
+        v = pop(keys, items, size)
         if closed[v]:
             continue
         level = _level(steps, nodes, v, levels)
@@ -150,7 +146,7 @@ def expand(steps, ends, levels, bound, tree, queue, counts):  # type: ignore[no-
         if segment_free(steps, nodes[v], ends[1]):
             counts[_LAST] = v
             return _FOUND
-        _offer(steps, ends, v, level, bound, tree, queue, counts)
+        _offer(steps, ends, v, level, bound, tree, heap, counts)
     return _OPEN
 
 
@@ -189,11 +185,12 @@ def _settle(steps, v, level, tree):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _offer(steps, ends, v, level, bound, tree, queue, counts):  # type: ignore[no-untyped-def]
+def _offer(steps, ends, v, level, bound, tree, heap, counts):  # type: ignore[no-untyped-def]
     """Offer every neighbour of `v` the straight way from the parent of `v`."""
-    parent = tree[2][v, _PARENT]
+    index, nodes, links, closed = tree
+    parent = links[v, _PARENT]
     from_ = parent if parent > 0 else v
-    i0, j0, k0 = int(tree[1][v, 0]) >> level, int(tree[1][v, 1]) >> level, int(tree[1][v, 2]) >> level
+    i0, j0, k0 = int(nodes[v, 0]) >> level, int(nodes[v, 1]) >> level, int(nodes[v, 2]) >> level
     half = (1 << level) >> 1
     for i in range(max(i0 - 1, 0), i0 + 2):
         for j in range(max(j0 - 1, 0), j0 + 2):
@@ -201,29 +198,30 @@ def _offer(steps, ends, v, level, bound, tree, queue, counts):  # type: ignore[n
                 x, y, z = (i << level) + half, (j << level) + half, (k << level) + half
                 if x >= steps.shape[0] or y >= steps.shape[1] or z >= steps.shape[2] or steps[x, y, z] == 0:
                     continue
-                _hang(steps, ends, (v, from_), (x, y, z), bound, tree, queue, counts)
+                u = index[(x * steps.shape[1] + y) * steps.shape[2] + z]
+                if u == 0 or not closed[u]:
+                    _hang(steps, ends, (v, from_), (x, y, z), bound, tree, heap, counts)
 
 
 @njit(cache=True, nogil=True)
-def _hang(steps, ends, above, place, bound, tree, queue, counts):  # type: ignore[no-untyped-def]
+def _hang(steps, ends, above, place, bound, tree, heap, counts):  # type: ignore[no-untyped-def]
     """The node of a cell hangs on `above`[1], found through `above`[0], if that is cheaper than before."""
     index, nodes, links, closed = tree
     cell = (place[0] * steps.shape[1] + place[1]) * steps.shape[2] + place[2]
     u, new = index[cell], counts[_NODES]
-    if u > 0 and closed[u]:
-        return
     if u == 0:
         u = new
         for a in range(3):
             nodes[u, a] = place[a] + _PLACE[a]
         nodes[u, COST] = NEVER
-    cost, left = nodes[above[1], COST] + gap(nodes, above[1], nodes, u), gap(nodes, u, ends, 1)
-    if cost >= nodes[u, COST] - 1e-9 or cost + left >= bound[1]:
+    cost = nodes[above[1], COST] + gap(nodes, above[1], nodes, u)
+    if cost >= nodes[u, COST] - 1e-9:
         return
-    if not segment_free(steps, nodes[above[0]], nodes[u]):
+    left = gap(nodes, u, ends, 1)
+    if cost + left >= bound[1] or not segment_free(steps, nodes[above[0]], nodes[u]):
         return
     if u == new:
         index[cell], links[u, _CELL], closed[u] = u, cell, False
         counts[_NODES] = new + 1
     links[u, _PARENT], links[u, _VIA], nodes[u, COST] = above[1], above[0], cost
-    push(queue[0], queue[1], queue[2], u, cost + bound[0] * left)
+    push(heap[0], heap[1], heap[2], cost + bound[0] * left, u)

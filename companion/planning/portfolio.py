@@ -10,7 +10,6 @@ then on RRT* and shortcuts better the way, and the finer lattices look for short
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Annotated
 
@@ -20,12 +19,14 @@ import numpy as np
 from companion.core.messages import Array
 from companion.planning.lazy_theta import COARSEST, LazyTheta
 from companion.planning.planner import CellSpace, Plan, trivial
-from companion.planning.reach import reachable
+from companion.planning.reach import Reach
 from companion.planning.rrt_star import RRTStar, RRTStarConfig, Search
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 _LEVELS = ((3, COARSEST), (2, COARSEST), (1, COARSEST), (0, COARSEST), (0, 0))
 """Finest and coarsest lattice of the searches, one after the other; the last has every cell."""
+
+_ROOM_COLUMNS = 4000  # columns of a small room, counted each time that it spreads
 
 
 class PortfolioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -39,6 +40,8 @@ class PortfolioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """And in easy ones, beside RRT*."""
     first_shortcuts: Count = 200
     """Attempts to shorten what RRT-Connect or the lattice found."""
+    greed: Annotated[float, msgspec.Meta(ge=1)] = 3.0
+    """Weight of the straight distance in the lattice while there is no way; then 1."""
 
 
 class Portfolio:
@@ -90,15 +93,21 @@ class PortfolioSearch:
     ) -> None:
         self._config, self._tree, self._lattice, self._space, self._ends = config, tree, lattice, space, ends
         self._levels = list(_LEVELS)
-        self._looking = self._known_reachable = False
+        self._looking = False
+        self._reach: Reach | None = None
+        self._joined: bool | None = None  # do free cells lead to the goal? None: not known yet
         self._is_new = True  # the first way is not shortened yet
-        self.infeasible = False
         self.samples = self._samples_first = 0
 
     @property
     def solved(self) -> bool:
         """Is there a way?"""
         return self._tree.solved
+
+    @property
+    def infeasible(self) -> bool:
+        """Is it proven that there is no way?"""
+        return self._joined is False
 
     @property
     def ended(self) -> bool:
@@ -108,7 +117,7 @@ class PortfolioSearch:
     @property
     def cost_m(self) -> float:
         """Length of the best way; infinite: none yet."""
-        return self._tree.best_cost * self._space.resolution_m if self.solved else math.inf
+        return self._tree.cost_m
 
     def advance(self, rng: np.random.Generator) -> None:
         """One round: one chunk of samples, and a portion of the lattice; a first way is shortened in the next."""
@@ -119,7 +128,9 @@ class PortfolioSearch:
             return
         self._samples_first = self.samples
         tree.first(rng)
-        if not self.solved and self.samples >= config.alone:
+        if self.solved:
+            self._looking = False  # a greedy search is of no more use
+        elif self.samples >= config.alone and not self._is_enclosed():
             self._look(config.hard_expansions, rng)
 
     def _better(self, rng: np.random.Generator) -> None:
@@ -141,23 +152,26 @@ class PortfolioSearch:
         state = self._lattice.advance(expansions)
         if state == "open":
             return
-        self._looking = False
-        self._levels.pop(0)
+        self._looking, was_first = False, not self.solved
         if state == "found":
-            self._tree.offer(self._lattice.path()[::-1], rng, self._config.first_shortcuts)
-        elif not self.solved and not self._known_reachable:
-            self._prove()
+            self._tree.offer(self._lattice.path(), rng, self._config.first_shortcuts)
+        if state == "exhausted" or not was_first:
+            self._levels.pop(0)
+        if not self.solved and self._joined is None and self._reach is not None:
+            self._joined = self._reach.joined()
 
     def _begin_level(self) -> None:
-        """From the goal to the start: if one of them is enclosed, it is rather the goal."""
-        self._looking, backwards = True, self._ends[::-1]
-        self._lattice.begin(self._space.steps, backwards, levels=self._levels[0], weight=1.0, most=self._tree.best_cost)
+        self._looking, most = True, self._tree.best_cost
+        weight = 1.0 if self.solved else self._config.greed
+        self._lattice.begin(self._space.steps, self._ends, levels=self._levels[0], weight=weight, most=most)
 
-    def _prove(self) -> None:
-        """Flood fill, once."""
-        start, goal = np.floor(self._ends).astype(np.int64)
-        self._known_reachable = reachable(self._space.steps, start, goal)
-        self.infeasible = not self._known_reachable
+    def _is_enclosed(self) -> bool:
+        """A small room around the goal is found at once; a large one when the coarsest lattice has found no way."""
+        if self._reach is None:
+            start, goal = np.floor(self._ends).astype(np.int64)
+            self._reach = Reach(self._space.steps, start, goal)
+            self._joined = self._reach.joined(most_columns=_ROOM_COLUMNS)
+        return self.infeasible
 
     def result(self) -> Plan:
         """The best way, or the proof that there is none."""

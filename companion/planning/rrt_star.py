@@ -181,6 +181,11 @@ class Search:
         """Is there a path?"""
         return self.best_cost < NEVER
 
+    @property
+    def cost_m(self) -> float:
+        """Length of the best path; infinite: none yet."""
+        return self.best_cost * self._space.resolution_m if self.solved else math.inf
+
     def grow(self, rng: np.random.Generator) -> None:
         """One chunk of samples for RRT*."""
         draws = rng.random((self.config.chunk, grow.DRAWS))
@@ -213,7 +218,7 @@ class Search:
             self._hang(self._path[:count])
             self._keep_if_better()
 
-    def result(self, iterations: int) -> Plan:
+    def result(self, iterations: int = 0) -> Plan:
         """The best path, or the way towards the goal as far as it goes."""
         count = int(self._counts[grow.BEST])
         if count:
