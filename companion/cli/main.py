@@ -67,7 +67,13 @@ GROUPS = {  # group -> help, command -> module and function
     ),
     "bench": (
         "Measure this machine.",
-        {"bus": "bench:bus", "mapping": "bench_mapping:mapping", "planners": "bench_planners:planners"},
+        {
+            "bus": "bench:bus",
+            "mapping": "bench_mapping:mapping",
+            "planners": "bench_planners:planners",
+            "planning": "bench_planning:planning",
+            "tracking": "bench_tracking:tracking",
+        },
     ),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",

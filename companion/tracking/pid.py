@@ -1,4 +1,4 @@
-"""PID on a vector error, with a bounded integral that does not wind up."""
+"""PID on a vector error: derivative on the measurement, and a bounded integral that does not wind up."""
 
 from __future__ import annotations
 
@@ -8,30 +8,31 @@ import msgspec
 import numpy as np
 
 from companion.core.messages import Array
+from companion.tracking.demand import limited
 
 Gain = Annotated[float, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class PidConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Cross-track error (m) to velocity correction (m/s). The autopilot's own position gain comes on top."""
+    """Error from the path (m) to velocity correction (m/s). At hover the autopilot's own position gain adds to it."""
 
-    kp_per_s: Gain = 0.8
+    kp_per_s: Gain = 3.0
     """Proportional gain."""
-    ki_per_s2: Gain = 0.15
+    ki_per_s2: Gain = 1.0
     """Integral gain."""
-    kd: Gain = 0.0
-    """Derivative gain."""
+    kd: Gain = 1.0
+    """Derivative gain, on the measured velocity across the path."""
     integral_limit_m_s: Gain = 0.3
     """Largest share of the integral in the output, norm."""
-    output_limit_m_s: Positive = 0.8
+    output_limit_m_s: Positive = 1.0
     """Largest correction, norm."""
 
 
 class Pid:
     """`step` once per control period.
 
-    >>> Pid(PidConfig()).step(np.array([0.0, 0.3, 0.0]), dt_s=0.02)
+    >>> Pid(PidConfig()).step(np.array([0.0, 0.3, 0.0]), measured_rate=np.zeros(3), dt_s=0.02)
     """
 
     def __init__(self, config: PidConfig) -> None:
@@ -41,25 +42,18 @@ class Pid:
     def reset(self) -> None:
         """Forget the past."""
         self.integral = np.zeros(3)  # m/s, already times ki
-        self._last: Array | None = None
 
-    def step(self, error: Array, *, dt_s: float) -> Array:
-        """Correction (3,) m/s for an error (3,) m.
+    def step(self, error: Array, *, measured_rate: Array, dt_s: float) -> Array:
+        """Correction (3,) m/s for an error (3,) m and the rate (3,) m/s of what is measured.
 
-        The integral stands still while the output is limited and the error would push on
-        (conditional integration).
+        The derivative is that of the measurement: a reference that jumps gives no kick. The integral
+        stands still while the output is limited and the error would push on (conditional integration;
+        Astrom and Murray, Feedback Systems, 2008, 10.4).
         """
         config = self.config
-        slope = np.zeros(3) if self._last is None else (error - self._last) / dt_s
-        self._last = error.copy()
-        grown = _limited(self.integral + config.ki_per_s2 * error * dt_s, config.integral_limit_m_s)
-        wished = config.kp_per_s * error + grown + config.kd * slope
-        output = _limited(wished, config.output_limit_m_s)
+        grown = limited(self.integral + config.ki_per_s2 * error * dt_s, config.integral_limit_m_s)
+        wished = config.kp_per_s * error + grown - config.kd * measured_rate
+        output = limited(wished, config.output_limit_m_s)
         if np.array_equal(output, wished) or float(error @ wished) < 0.0:
             self.integral = grown
         return output
-
-
-def _limited(v: Array, most: float) -> Array:
-    size = float(np.linalg.norm(v))
-    return v if size <= most else v * (most / size)

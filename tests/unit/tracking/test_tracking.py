@@ -8,8 +8,10 @@ import pytest
 from companion.core import topics
 from companion.core.geometry import quaternion_from_yaw, wrap_angle
 from companion.core.messages import Odometry, SafetyStatus, Trajectory
+from companion.tracking.follow import FollowConfig, Follower
 from companion.tracking.node import TrackingConfig, TrackingNode
-from companion.tracking.pure_pursuit import Pursuit, PursuitConfig
+from companion.tracking.path import TrackedPath
+from companion.tracking.preview import PreviewConfig, preview
 
 MS = 1_000_000
 
@@ -72,7 +74,7 @@ class Vehicle:
         self.lag_s, self.gust, self.rng = lag_s, gust, np.random.default_rng(seed)
 
     def step(self, demand, dt):
-        off = 0.95 * (demand.p_odom - self.p) + demand.v_odom - self.v
+        off = np.nan_to_num(0.95 * (demand.p_odom - self.p)) + demand.v_odom - self.v
         self.integral = np.clip(self.integral + 0.4 * off * dt, -3.0, 3.0)
         wanted = np.clip(1.8 * off + self.integral - 0.2 * self.a + demand.a_odom, -6.0, 6.0)
         self.a += (wanted - self.a) * dt / self.lag_s
@@ -81,9 +83,9 @@ class Vehicle:
         self.p = self.p + self.v * dt
 
 
-def fly(points, speed, *, seconds, seed=0, say=lambda t: word(), accel=3.0, refresh=True):
+def fly(points, speed, *, seconds, seed=0, say=lambda t: word(), accel=3.0, refresh=True, gust=0.5, config=None):
     """(trace (N, 3), setpoints) of a node that follows one trajectory, sent anew at 5 Hz."""
-    node, vehicle = TrackingNode(TrackingConfig()), Vehicle(points[0], seed=seed)
+    node, vehicle = TrackingNode(config or TrackingConfig()), Vehicle(points[0], seed=seed, gust=gust)
     trace, demands = [], []
     for n in range(round(seconds * 100)):
         now_ns = n * 10 * MS
@@ -116,35 +118,28 @@ def ramp(points, top, accel=2.0):
 # --- preview ---------------------------------------------------------------------------
 
 
+def preview_at(points, speeds, p, v, **options):
+    path = TrackedPath(points, speeds, accel_limit=3.0)
+    return preview(path, path.at(path.nearest(p)), v, PreviewConfig(drag_per_s=0.0, **options))
+
+
 def test_preview_on_a_circle_has_tangent_and_centripetal_acceleration():
-    points = circle(5.0)
-    pursuit = Pursuit(points, np.full(len(points), 2.0), accel_limit=3.0, config=PursuitConfig(reaction_s=0.2))
-    angle = 1.0
+    points, angle = circle(5.0), 1.0
     p = np.array([5.1 * np.sin(angle), 5 - 5.1 * np.cos(angle), 2.0])  # 0.1 m outside
-    seen = pursuit.preview(p, np.array([2 * np.cos(1.08), 2 * np.sin(1.08), 0.0]))
-    assert seen.s_m == pytest.approx(5.0, abs=0.01)
-    assert np.linalg.norm(seen.error) == pytest.approx(0.1, abs=0.002)
+    v = np.array([2 * np.cos(1.08), 2 * np.sin(1.08), 0.0])
+    seen = preview_at(points, np.full(len(points), 2.0), p, v, reaction_s=0.2)
+    assert seen.here.s_m == pytest.approx(5.0, abs=0.01)
+    assert np.linalg.norm(seen.here.p - p) == pytest.approx(0.1, abs=0.002)
     ahead = angle + 2.0 * 0.2 / 5.0
     assert np.allclose(seen.v, [2 * np.cos(ahead), 2 * np.sin(ahead), 0.0], atol=0.01)
     assert np.allclose(seen.a, 4.0 / 5.0 * np.array([-np.sin(ahead), np.cos(ahead), 0.0]), atol=0.02)
 
 
-def test_velocity_and_acceleration_are_consistent_along_a_speed_ramp():
+@pytest.mark.parametrize(("x", "sign"), [(2.0, 1.0), (8.0, -1.0)])
+def test_velocity_and_acceleration_are_consistent_along_a_speed_ramp(x, sign):
     points = line(10.0)
-    pursuit = Pursuit(points, ramp(points, 9.0), accel_limit=3.0, config=PursuitConfig())
-    for x, sign in ((2.0, 1.0), (8.0, -1.0)):
-        seen = pursuit.preview(np.array([x, 0.0, 2.0]), np.array([2.83, 0.0, 0.0]))
-        assert np.allclose(seen.a, [sign * 2.0, 0.0, 0.0], atol=0.05)
-        pursuit = Pursuit(points, ramp(points, 9.0), accel_limit=3.0, config=PursuitConfig())
-
-
-def test_the_nearest_point_does_not_jump_to_another_lane():
-    points = lane(0.5)  # the way back is 1 m beside the way out
-    pursuit = Pursuit(points, np.full(len(points), 2.0), accel_limit=3.0, config=PursuitConfig())
-    found = [
-        pursuit.preview(np.array([x, min(0.08 * x, 0.7), 2.0]), np.zeros(3)).s_m for x in np.arange(0.0, 15.0, 0.5)
-    ]
-    assert np.all(np.diff(found) > 0) and found[-1] < 16.0
+    seen = preview_at(points, ramp(points, 9.0), np.array([x, 0.0, 2.0]), np.array([2.83, 0.0, 0.0]))
+    assert np.allclose(seen.a, [sign * 2.0, 0.0, 0.0], atol=0.05)
 
 
 # --- in flight -------------------------------------------------------------------------
@@ -168,10 +163,62 @@ def test_it_leaves_a_standing_start_and_ends_at_the_end():
     assert np.linalg.norm(demands[-1].v_odom) < 0.3 and np.linalg.norm(demands[-1].p_odom - points[-1]) < 0.1
 
 
+@pytest.mark.parametrize(("method", "worst_m"), [("preview", 0.3), ("pure_pursuit", 0.6), ("pid", 0.9)])
+@pytest.mark.parametrize("seed", range(2))
+def test_every_setpoint_keeps_the_limits_and_every_method_flies(method, worst_m, seed):
+    points, top, accel = lane(), 3.0, 3.0
+    config = TrackingConfig(follow=FollowConfig(method=method))
+    trace, demands = fly(points, ramp(points, top), seconds=22.0, seed=seed, accel=accel, config=config)
+    v = np.array([d.v_odom for d in demands])
+    assert np.linalg.norm(v, axis=1).max() <= top + 1e-9
+    assert np.linalg.norm([d.a_odom for d in demands], axis=1).max() <= accel + 1e-9
+    change = np.linalg.norm(np.diff(v, axis=0), axis=1) / 0.02
+    assert change.max() <= config.follow.change_share * accel + 1e-6
+    assert np.linalg.norm(trace[-1] - points[-1]) < 0.4
+    assert cross_track(trace, points).max() < worst_m
+
+
+@pytest.mark.parametrize("top", [1.5, 3.0])
+def test_the_end_is_not_overshot_without_wind(top):
+    points = line(12.0)
+    trace, _ = fly(points, ramp(points, top), seconds=16.0, gust=0.0)
+    assert trace[:, 0].max() < 12.1 and trace[-1, 0] == pytest.approx(12.0, abs=0.03)
+
+
+def test_a_path_that_turns_off_gives_no_jump():
+    follower = Follower(FollowConfig(), period_s=0.02)
+    state = odometry([1.0, 0.0, 2.0], v=(2.0, 0.0, 0.0))
+    follower.take(trajectory(line(), 2.0))
+    before = follower.setpoint(0, state, scale=1.0)
+    follower.take(trajectory(line()[:, [1, 0, 2]] + np.array([1.0, 0.0, 0.0]), 2.0))  # to the left
+    after = follower.setpoint(20 * MS, state, scale=1.0)
+    assert np.linalg.norm(after.v_odom - before.v_odom) <= 2.0 * 3.0 * 0.02 + 1e-9
+
+
+def test_position_is_asked_for_near_hover_only():
+    follower = Follower(FollowConfig(), period_s=0.02)
+    follower.take(trajectory(line(), 2.0))
+    fast = follower.setpoint(0, odometry([5.0, 0.1, 2.0], v=(2.0, 0.0, 0.0)), scale=1.0)
+    assert np.all(np.isnan(fast.p_odom)) and fast.v_odom[1] < 0.0
+    follower.take(trajectory(line(5.0), np.r_[np.full(50, 0.3), 0.0]))
+    slow = follower.setpoint(20 * MS, odometry([5.0, 0.1, 2.0]), scale=1.0)
+    assert np.allclose(slow.p_odom, [5.0, 0.0, 2.0], atol=1e-9)
+
+
+def test_astray_it_first_comes_back():
+    speeds = []
+    for off in (0.0, 0.8, 2.0):
+        follower = Follower(FollowConfig(), period_s=0.02)
+        follower.take(trajectory(line(), 2.0))
+        state = odometry([5.0, off, 2.0], v=(2.0, 0.0, 0.0))
+        demands = [follower.setpoint(n * 20 * MS, state, scale=1.0) for n in range(60)]
+        speeds.append(demands[-1].v_odom[0])
+    assert speeds[0] > speeds[1] > speeds[2] > 0.3
+
+
 def test_a_vehicle_that_stands_is_not_told_to_brake():
     points = line(6.0)
-    pursuit = Pursuit(points, ramp(points, 2.0), accel_limit=3.0, config=PursuitConfig())
-    seen = pursuit.preview(np.array([5.6, 0.0, 2.0]), np.zeros(3))
+    seen = preview_at(points, ramp(points, 2.0), np.array([5.6, 0.0, 2.0]), np.zeros(3))
     assert np.allclose(seen.a, 0.0) and seen.v[0] > 0.5
 
 
@@ -279,7 +326,8 @@ def test_an_older_trajectory_does_not_replace_a_newer():
     node = ready_node(line())
     list(node.handle(topics.TRAJECTORY, trajectory(line()[:, [1, 0, 2]], 1.0, stamp_ns=100 * MS)))
     list(node.handle(topics.TRAJECTORY, trajectory(line(), 1.0, stamp_ns=50 * MS)))
-    (output,) = node.tick("control", 110 * MS)
+    for _ in range(20):
+        (output,) = node.tick("control", 110 * MS)
     assert output.message.v_odom[1] > 0.9
 
 
