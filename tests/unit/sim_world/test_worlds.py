@@ -181,7 +181,7 @@ def test_errors_of_stem_maps(value, field, valid):
 @pytest.mark.parametrize(
     ("value", "field", "valid"),
     [
-        ("jungle", "world", "demo, empty, longleaf-style, poisson"),
+        ("jungle", "world", "demo, empty, longleaf-style, moving, poisson"),
         ("poisson,trees=3", "trees", "stems_per_ha"),
         ("poisson,stems_per_ha=many", "stems_per_ha", ""),
         ("poisson,stems_per_ha=-1", "stems_per_ha", ""),
