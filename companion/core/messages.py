@@ -305,6 +305,9 @@ class Trajectory:
     yaw_rate_limit: float  # rad/s
 
 
+PROVEN = "no way"  # begins PlanStatus.reason when the planner has proven it on the present map
+
+
 @message
 class PlanStatus:
     stamp_ns: int
@@ -314,6 +317,7 @@ class PlanStatus:
     plan_p_odom: Array  # the geometric plan, (N, 3)
     cost_m: float
     iterations: int
+    reason: str = ""  # why it is blocked; PROVEN begins the words of a proof that there is no way
 
 
 @message

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from companion.core.geometry import wrap_angle
-from companion.core.messages import Array, Goal, Limits, PlanStatus, freeze
+from companion.core.messages import PROVEN, Array, Goal, Limits, PlanStatus, freeze
 from companion.mission.placing import Correction, Places
 from companion.mission.route import Leg
 from companion.mission.schema import AnyStep
@@ -63,6 +63,8 @@ class Run:
             self.anchor_odom, self.anchor_ns = p_odom, now_ns
         if self.late(now_ns):
             return "timeout"
+        if plan is not None and plan.state == "blocked" and plan.reason.startswith(PROVEN):
+            return f"the planner has proven: {plan.reason}"
         if self.blocked_ns is not None and now_ns - self.blocked_ns > stuck_s * 1e9:
             return f"the planner found no way for {stuck_s:g} s"
         if now_ns - self.anchor_ns > stuck_s * 1e9:

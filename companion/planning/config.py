@@ -36,6 +36,8 @@ class PlanningConfig(PlannerSettings, frozen=True, forbid_unknown_fields=True, k
     """Planned beyond a goal that is flown through."""
     ground_within_m: Metres = 1.5
     """Ground seen this near to a goal gives its height."""
+    proven_after: Count = 4
+    """Proofs in a row, one per map, that no way leads to the goal, until the plan is `blocked` for that reason."""
     blocked_after: Count = 5
     """Failed replans in a row until the plan is `blocked`."""
     creep_after: Count = 5

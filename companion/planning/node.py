@@ -107,6 +107,7 @@ class PlanningNode(Node):
             plan_p_odom=ahead,
             cost_m=flown.reach_m if flown is not None else math.nan,
             iterations=replanner.iterations,
+            reason=replanner.reason if replanner.state == "blocked" else "",
         )
 
 

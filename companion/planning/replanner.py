@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from companion.core.messages import Array, Array32, Goal, LocalMap
+from companion.core.messages import PROVEN, Array, Array32, Goal, LocalMap
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import SLOW_M_S, Commitment, Flown, braked, clear_m, commit, with_speeds
 from companion.planning.polyline import cut, length, project, resample, without_repeats
@@ -45,7 +45,7 @@ class Replanner:
         self.flown: Flown | None = None
         self.goal: Goal | None = None
         self.reached = False
-        self.iterations = self._fails = self._still = self._replans = 0
+        self.iterations = self._fails = self._still = self._replans = self._proofs = 0
         self._target: Array | None = None  # where the route leads; None: none yet
         self._goal_odom = np.zeros(3)  # the goal with its height from the ground
         self._planned_radius_m = hull_radius_m
@@ -55,7 +55,7 @@ class Replanner:
     def take_goal(self, goal: Goal) -> None:
         """A new goal; the way being flown stays until the next `update`."""
         self.goal, self.reached, self._begun = goal, False, False
-        self._fails = self._still = 0
+        self._fails = self._still = self._proofs = 0
         self._target = None
 
     @property
@@ -65,8 +65,18 @@ class Replanner:
             return "idle"
         if self.reached:
             return "reached"
-        blocked = self._fails >= self.config.blocked_after or self._still >= self.config.stuck_after
-        return "blocked" if blocked else "flying"
+        return "blocked" if self.reason else "flying"
+
+    @property
+    def reason(self) -> str:
+        """Why the plan is blocked; '' if it is not."""
+        if self._proofs >= self.config.proven_after:
+            return f"{PROVEN}: no free cells lead to the goal"
+        if self._fails >= self.config.blocked_after:
+            return f"no route found {self._fails} times in a row"
+        if self._still >= self.config.stuck_after:
+            return "standing although there is a route"
+        return ""
 
     def look(self, p_odom: Array, v_odom: Array) -> None:
         """Notice whether the goal is reached."""
@@ -146,6 +156,7 @@ class Replanner:
         if self.reached and self._good(kept, spaces.widest):
             return self._flown_along(kept, kept.rest, spaces.widest)
         route = self._find(spaces, kept, goal, rng)
+        self._proofs = self._proofs + 1 if route is None and self._finder.proven else 0
         old = self._old_way(kept, route, spaces.widest)
         if route is None:
             return self._without_route(kept, old, spaces.widest, now)

@@ -84,6 +84,8 @@ class RouteFinder:
     def __init__(self, config: RouteConfig, planner: Planner, *, hull_radius_m: float) -> None:
         self.config, self.hull_radius_m = config, hull_radius_m
         self._planner = planner
+        self.proven = False
+        """Did the last `find` prove that no way leads to a goal inside the map, even with the least clearance?"""
 
     def radii_m(self, limits: Limits) -> list[float]:
         """Planning radii, widest first."""
@@ -115,6 +117,7 @@ class RouteFinder:
     ) -> Route | None:
         """Route to within `accept_m` of the goal, or to the border of the map; None: not found."""
         for space in spaces:
+            self.proven = False
             escape = escape_from(start, space, within_m=self.config.escape_m)
             place = place_for(goal, space, start, within_m=accept_m, margin_m=self.config.border_margin_m)
             if escape is None or place is None:
@@ -123,6 +126,7 @@ class RouteFinder:
             plan = self._planner.plan(
                 escape[-1], target, space, rng=rng, iterations=self.config.iterations, known_path=known_path
             )
+            self.proven = plan.proof == "infeasible" and not at_border
             if plan.solved:
                 off = float(np.linalg.norm(target - goal))
                 return _route(escape, plan, space, at_border=at_border, substitute=not at_border and off > 0.1)
