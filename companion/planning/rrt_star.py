@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -18,9 +17,9 @@ from companion.planning import connect as two_trees
 from companion.planning import grow, shortcut
 from companion.planning.planner import CellSpace, Plan, trivial
 from companion.planning.polyline import length, without_repeats
-from companion.planning.tree import COST, NEVER, PARENT, add, way_to
+from companion.planning.tree import COST, NEVER, PARENT, way_to
+from companion.planning.trees import FROM_GOAL, FROM_START, OWN, PATH_POINTS, Trees
 
-_PATH_POINTS = 2048
 _SPARE_NODES = 2048  # for chains of known and shortened paths
 
 
@@ -43,6 +42,12 @@ class RRTStarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Iterations between two rounds of shortening."""
     shortcuts: Annotated[int, msgspec.Meta(ge=0)] = 60
     """Attempts per round of shortening."""
+    easy_chunks: Annotated[int, msgspec.Meta(ge=0)] = 4
+    """If more chunks than these were needed to find the first path, RRT-Connect goes on looking for others."""
+    restart_chunks: Annotated[int, msgspec.Meta(ge=0)] = 4
+    """Chunks of it beside one of RRT*."""
+    restart_shortcuts: Annotated[int, msgspec.Meta(ge=0)] = 200
+    """Attempts to shorten each of those."""
     bucket_m: Annotated[float, msgspec.Meta(gt=0)] = 2.4
     """Edge of the nearest-neighbour buckets."""
 
@@ -52,7 +57,7 @@ class RRTStar:
 
     def __init__(self, config: RRTStarConfig) -> None:
         self.config = config
-        self._memory: _Memory | None = None
+        self._memory: Trees | None = None
         self._last: Search | None = None
 
     def edges(self) -> Array:
@@ -94,56 +99,33 @@ class RRTStar:
             search.take_known(known_path)
         return search
 
-    def _scratch(self, space: CellSpace, iterations: int) -> _Memory:
+    def _scratch(self, space: CellSpace, iterations: int) -> Trees:
         nodes = iterations + self.config.chunk + _SPARE_NODES
         bucket = self.config.bucket_m / space.resolution_m
         shape: NDArray[np.int64] = np.array(space.steps.shape)
         grid = tuple(int(n) for n in np.ceil(shape / bucket))
         memory = self._memory
         if memory is None or memory.nodes.shape[1] < nodes or memory.heads.shape[1:] != grid:
-            memory = self._memory = _Memory.of(nodes, grid)
+            memory = self._memory = Trees.of(nodes, grid)
         return memory
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Memory:
-    """Two trees: [0] RRT* and the start's, [1] the goal's of RRT-Connect."""
-
-    nodes: Array
-    links: NDArray[np.int32]
-    heads: NDArray[np.int32]
-    path: Array
-
-    @classmethod
-    def of(cls, nodes: int, grid: tuple[Any, ...]) -> _Memory:
-        links = np.full((2, nodes, 4), -1, np.int32)
-        heads = np.full((2, *grid), -1, np.int32)
-        return cls(np.zeros((2, nodes, 4)), links, heads, np.zeros((_PATH_POINTS, 3)))
-
-    def plant(self, which: int, roots: Array, bucket: float) -> None:
-        """Empty a tree and give it its roots (K, 3); only the first is found by searches."""
-        self.heads[which].fill(-1)
-        self.nodes[which, : len(roots), :3] = roots
-        self.nodes[which, : len(roots), COST] = NEVER
-        self.links[which, : len(roots)] = -1
-        add(self.nodes[which], self.links[which], self.heads[which], 0, -1, bucket)
 
 
 class Search:
     """One run: the tree, the best path so far, and rounds of growing and shortening. Lengths in cells."""
 
-    def __init__(self, config: RRTStarConfig, space: CellSpace, memory: _Memory, start: Array, goal: Array) -> None:
+    def __init__(self, config: RRTStarConfig, space: CellSpace, memory: Trees, start: Array, goal: Array) -> None:
         self.config, self._space, self._memory = config, space, memory
         self._ends = space.to_cells(np.stack([start, goal]))
         self._bucket = config.bucket_m / space.resolution_m
-        memory.plant(0, self._ends, self._bucket)
+        memory.plant(OWN, self._ends, self._bucket)
         self._tree = (memory.nodes[0], memory.links[0], memory.heads[0])
         self._counts = np.array([2, 0, grow.START])
-        self._best, self._path = np.zeros((_PATH_POINTS, 3)), memory.path
+        self._best, self._path = np.zeros((PATH_POINTS, 3)), memory.path
         self.best_cost = NEVER
         self._forced = np.zeros((0, 3))
         self._box = space.sample_box
         self._frame: Array | None = None
+        self._chunks = 0  # until the first path
         self._pair: NDArray[np.int64] | None = None  # node counts of RRT-Connect's trees
 
     def take_known(self, path: Array) -> None:
@@ -165,7 +147,11 @@ class Search:
         """One chunk: towards a first path, or growth; then shortening of the best path."""
         if self.solved:
             self.grow(rng)
+            if self._chunks > self.config.easy_chunks:  # the first way that is found in a maze is rarely the best
+                for _ in range(self.config.restart_chunks):
+                    self.join(rng)
         else:
+            self._chunks += 1
             self.first(rng)
         self.shorten(rng)
 
@@ -207,7 +193,6 @@ class Search:
         """A free path (N, 3) between the ends that another planner found: shorten it, take it if it is better."""
         if len(path) > len(self._path):
             return
-        self._leave_pair()
         self._path[: len(path)] = path
         self._shorten(len(path), rng, attempts)
 
@@ -224,7 +209,8 @@ class Search:
         if count:
             path = self._space.to_odom(self._best[:count])
             return Plan(path=path, cost_m=length(path), iterations=iterations, solved=True)
-        count = self._way_to(self._nearest_to_goal())
+        which, node = (OWN, int(self._counts[grow.NEAREST])) if self._pair is None else (FROM_START, self._near_goal())
+        count = int(way_to(self._memory.nodes[which], self._memory.links[which], node, self._path))
         path = self._space.to_odom(self._path[: max(count, 1)])
         return Plan(path=path, cost_m=math.inf, iterations=iterations, solved=False)
 
@@ -234,29 +220,27 @@ class Search:
         hung = np.flatnonzero(links[: int(self._counts[grow.NODES]), PARENT] >= 0)
         return self._space.to_odom(np.stack([nodes[hung, :3], nodes[links[hung, PARENT], :3]], axis=1))
 
-    def join(self, rng: np.random.Generator) -> None:
-        """One chunk of RRT-Connect; its start tree lies in the place of RRT*'s, empty until there is a path."""
-        draws = rng.random((self.config.chunk, two_trees.DRAWS))
-        memory = self._memory
+    def join(self, rng: np.random.Generator) -> bool:
+        """One chunk of RRT-Connect; its first path is taken as it is, later ones if they are better once shortened."""
+        memory, bucket = self._memory, self._bucket
         if self._pair is None:
-            memory.plant(0, self._ends[:1], self._bucket)
-            memory.plant(1, self._ends[1:], self._bucket)
+            memory.plant(FROM_START, self._ends[:1], bucket)
+            memory.plant(FROM_GOAL, self._ends[1:], bucket)
             self._pair = np.array([1, 1])
+        draws = rng.random((self.config.chunk, two_trees.DRAWS))
         step = self.config.step_m / self._space.resolution_m
-        trees = (memory.nodes, memory.links, memory.heads)
-        arguments = (self._pair, self._box, draws, step, self._bucket, self._path)
-        count = two_trees.connect(self._space.steps, *trees, *arguments)
-        if count:
-            self._leave_pair()
+        count = two_trees.connect(
+            self._space.steps, *memory.pair, self._pair, self._box, draws, step, bucket, self._path
+        )
+        if not count:
+            return False
+        self._pair = None
+        if self.solved:
+            self._shorten(count, rng, self.config.restart_shortcuts)
+        else:
             self._hang(without_repeats(self._path[:count]))
             self._keep_if_better()
-
-    def _leave_pair(self) -> None:
-        """Give RRT*'s tree its place back."""
-        if self._pair is not None:
-            self._memory.plant(0, self._ends, self._bucket)
-            self._counts[:] = 2, 0, grow.START
-            self._pair = None
+        return True
 
     def _hang(self, path: Array) -> None:
         grow.add_chain(*self._tree, self._counts, self._bucket, np.ascontiguousarray(path))
@@ -272,10 +256,10 @@ class Search:
     def _way_to(self, node: int) -> int:
         return int(way_to(self._tree[0], self._tree[1], node, self._path))
 
-    def _nearest_to_goal(self) -> int:
-        if self._pair is None:
-            return int(self._counts[grow.NEAREST])
-        reached = self._memory.nodes[0, : self._pair[0], :3]
+    def _near_goal(self) -> int:
+        """Node of the start's tree nearest to the goal."""
+        assert self._pair is not None
+        reached = self._memory.nodes[FROM_START, : self._pair[0], :3]
         return int(np.argmin(np.linalg.norm(reached - self._ends[1], axis=1)))
 
     def _settings(self) -> Array:

@@ -82,7 +82,7 @@ def _ratio_row(world: str, ms: float, target: float, runs: list[tuple[int, Trace
 
 def _time_row(world: str, traces: Traces, best: list[float]) -> PlanningRow:
     """How much sooner than OMPL's best planner the way is within 2 % of the shortest, median over the runs."""
-    times = {name: _near_ms(runs, best) for name, runs in traces.items()}
+    times = {name: _near_ms(runs, best) for name, runs in _same_runs(traces).items()}
     medians = {name: float(np.median(ms)) for name, ms in times.items()}
     rival = min(PEERS, key=lambda name: (medians[name], float(np.median(_ratios_at(500.0, traces[name], best)))))
     target = 1.0 if world in FORESTS else _FASTER
@@ -98,9 +98,9 @@ def _time_row(world: str, traces: Traces, best: list[float]) -> PlanningRow:
 def _rrt_star_row(world: str, peer: str, traces: Traces, best: list[float]) -> PlanningRow:
     """Is our RRT* alone no longer than OMPL's at equal CPU time? Median ratios, worst of the checkpoints."""
     figures: dict[str, float | None] = {}
-    worst = -math.inf
+    worst, same = -math.inf, _same_runs(traces)
     for ms in _CHECKS_MS:
-        ours, theirs = (float(np.median(_ratios_at(ms, traces[n], best))) for n in ("rrt_star", peer))
+        ours, theirs = (float(np.median(_ratios_at(ms, same[n], best))) for n in ("rrt_star", peer))
         figures[f"ours_{ms:g}ms"], figures[f"peer_{ms:g}ms"] = ours, theirs
         if math.isfinite(theirs):
             worst = max(worst, ours - theirs)
@@ -110,6 +110,12 @@ def _rrt_star_row(world: str, peer: str, traces: Traces, best: list[float]) -> P
     return _row(
         world, f"ratio_less_{peer}", planner="rrt_star", value=value, target=0.0, met=met, figures=figures, note=note
     )
+
+
+def _same_runs(traces: Traces) -> Traces:
+    """The runs, with the same ends, that all planners have."""
+    count = min(len(runs) for runs in traces.values())
+    return {name: runs[:count] for name, runs in traces.items()}
 
 
 def _planner_row(world: str, name: str, traces: Traces, best: list[float]) -> PlanningRow:
