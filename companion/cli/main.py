@@ -75,6 +75,7 @@ GROUPS = {  # group -> help, command -> module and function
             "tracking": "bench_tracking:tracking",
         },
     ),
+    "tune": ("Find settings by flying with them in the simulator.", {"lookahead": "tune:lookahead"}),
     "topic": (
         "See, measure and publish topics on the bus; works with any ROS 2 machine that speaks rmw_zenoh.",
         {

@@ -35,6 +35,7 @@ class Flown(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     setpoint_p: Array  # (M, 3)
     setpoint_v: Array  # (M, 3)
     setpoint_a: Array  # (M, 3)
+    p_odom: Array  # (N, 3), the estimate at the truth's times
     clearance_m: float  # hull to trunks and branches, the smallest
     contact: str
     ended: bool  # came to rest at the end of the path
@@ -93,6 +94,7 @@ def _flown(pilot: PilotNode, heard: Listener) -> Flown:
         setpoint_p=_rows([s.p_odom for s in setpoints]),
         setpoint_v=_rows([s.v_odom for s in setpoints]),
         setpoint_a=_rows([s.a_odom for s in setpoints]),
+        p_odom=_at([o.stamp_ns for o in heard.odometry], _rows([o.p_odom for o in heard.odometry]), truth),
         clearance_m=min((t.clearance_m for t in truth), default=float("nan")),
         contact=heard.truth[-1].contact if heard.truth else "",
         ended=pilot.done and len(p_true) > 0 and float(np.linalg.norm(p_true[-1] - end)) < 1.0,
@@ -105,6 +107,12 @@ def _into_odom(heard: Listener) -> tuple[Array, Array]:
     truth = min(heard.truth, key=lambda t: abs(t.stamp_ns - first.stamp_ns))
     turn = rotation_from_quaternion(quaternion_from_yaw(yaw_of(first.q_odom_body) - yaw_of(truth.q_world_body)))
     return turn, first.p_odom - turn @ truth.p_world
+
+
+def _at(stamps_ns: list[int], rows: Array, truth: list[GroundTruth]) -> Array:
+    """Rows (K, 3) interpolated at the truth's times, (N, 3)."""
+    times = [t.stamp_ns for t in truth]
+    return np.column_stack([np.interp(times, stamps_ns, rows[:, k]) for k in range(3)])
 
 
 def _rows(rows: list[Array]) -> Array:

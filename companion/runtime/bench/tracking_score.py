@@ -19,13 +19,15 @@ _FORTH_M = 4.0
 
 
 class Score(msgspec.Struct, frozen=True, kw_only=True):
-    """All against the truth, but the setpoints' own."""
+    """All against the truth, but for what the names say."""
 
     rmse_m: float  # across the path
     worst_m: float
+    rmse_estimate_m: float  # across the path of where the vehicle believed to be: the tracker's own share
     top_m_s: float
     mean_m_s: float
     lag_m_s: float  # planned speed minus the vehicle's at the same place, mean
+    late_s: float  # flown minus planned time
     over_m_s: float  # the most that the vehicle was faster than the path's top speed
     past_end_m: float  # overshoot beyond the end, along the path
     jerk_m_s3: float  # of the true motion, rms, up to 2.5 Hz
@@ -42,6 +44,7 @@ def score(flown: Flown) -> Score:
     points = flown.course.points
     s, off, side = along_and_across(points, flown.p_true)
     along = arc_length(points)
+    believed = along_and_across(points, flown.p_odom)[1]
     speed = np.linalg.norm(flown.v_true, axis=1)
     under_way = (s > _END_M) & (s < along[-1] - _END_M)
     planned = np.interp(s, along, flown.course.speeds)
@@ -51,11 +54,13 @@ def score(flown: Flown) -> Score:
     return Score(
         rmse_m=_round(np.sqrt(np.mean(off[under_way] ** 2))),
         worst_m=_round(off[under_way].max()),
+        rmse_estimate_m=_round(np.sqrt(np.mean(believed[under_way] ** 2))),
         top_m_s=_round(speed.max()),
         mean_m_s=_round(speed[under_way].mean()),
         lag_m_s=_round((planned - speed)[under_way].mean()),
+        late_s=_round(flown.time_s[under_way][-1] - flown.time_s[under_way][0] - _planned_s(flown)),
         over_m_s=_round(speed.max() - flown.course.speeds.max()),
-        past_end_m=_round(max(float(((flown.p_true - points[-1]) @ end).max()), 0.0)),
+        past_end_m=_round(max(0.0, *((flown.p_true - points[-1]) @ end)[s > along[-1] - _END_M])),
         jerk_m_s3=_round(_jerk(flown, under_way)),
         setpoint_rate_m_s2=_round(np.sqrt(np.mean(np.sum(changes**2, axis=1)))),
         wobble_per_m=_round(crossings / along[-1]),
@@ -85,6 +90,14 @@ def along_and_across(points: Array, p: Array) -> tuple[Array, Array, Array]:
         off[n] = np.linalg.norm(gap[k])
         side[n] = way[k, 0] * gap[k, 1] - way[k, 1] * gap[k, 0]
     return s, off, side
+
+
+def _planned_s(flown: Flown) -> float:
+    """Time between the places between which figures are taken, as planned."""
+    along = arc_length(flown.course.points)
+    s = np.linspace(_END_M, along[-1] - _END_M, 2000)
+    speeds = np.interp(s, along, flown.course.speeds)
+    return float(np.sum(np.diff(s) / np.maximum(0.5 * (speeds[1:] + speeds[:-1]), 1e-3)))
 
 
 def _jerk(flown: Flown, rows: NDArray[np.bool_]) -> float:
