@@ -23,6 +23,7 @@ from companion.runtime.bench.planning_worlds import PAIRS, enclosed_goal, planni
 
 ENCLOSED = "enclosed"
 _MOST_SAMPLES = 200_000  # the clock ends a run long before
+_WARM_S = 0.02  # of a run before each that is measured: forking OMPL's children leaves pages that are slow to write
 _LONG_S, _LONG_RUNS = 1.5, 1  # of the reference
 
 
@@ -53,12 +54,13 @@ def bench_planning(
         for run in range(options.runs):
             pair, seed = run % PAIRS, run // PAIRS
             for ours, machine in (("portfolio", portfolio), ("rrt_star", rrt_star)):
+                run_ours(machine, world, pair, seed=1_000_000 + seed, budget_s=_WARM_S)
                 trace = run_ours(machine, world, pair, seed=seed, budget_s=options.budget_s)
                 traces.setdefault(ours, []).append((pair, trace))
             for peer in peers if run < options.peer_runs else ():
                 trace = run_peer(peer, world.space, *world.ends[pair], seed=run, budget_s=options.budget_s)
                 traces.setdefault(peer, []).append((pair, trace))
-        yield from world_rows(world.name, traces, _reference(portfolio, world, traces), skipped=missing())
+        yield from world_rows(name, traces, _reference(portfolio, world, traces), skipped=missing())
 
 
 def run_ours(machine: Portfolio | RRTStar, world: World, pair: int, *, seed: int, budget_s: float) -> Trace:

@@ -9,11 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import label
 
+from companion.planning import connect, grow, lazy_theta, reach
+from companion.planning.config import PlanningConfig
 from companion.planning.grid_space import GridSpace
 from companion.planning.polyline import length
 from companion.planning.portfolio import Portfolio, PortfolioConfig
+from companion.planning.route import RouteConfig
 from companion.planning.rrt_star import RRTStarConfig
 from companion.planning.space import FieldSpace
+from companion.planning.warm_up import warm_up
 
 
 def plan(space, start, goal, *, iterations=300, seed=0, known_path=None, **config):
@@ -117,3 +121,15 @@ def test_a_free_straight_line_is_the_optimum_and_costs_nothing(walled):
     goal = START + np.array([2.0, 3.0, 1.0])
     result = plan(walled, START, goal)
     assert result.iterations == 0 and result.proof == "optimal" and np.array_equal(result.path, [START, goal])
+
+
+def test_the_warm_up_compiles_every_kernel_that_a_plan_may_need(walled, local_map):
+    kernels = (lazy_theta.plant, lazy_theta.expand, reach.flood, connect.connect, grow.grow, grow.add_chain)
+    warm_up(PlanningConfig(route=RouteConfig(planner="portfolio")), hull_radius_m=0.3)
+    before = [len(kernel.signatures) for kernel in kernels]
+    assert min(before) > 0
+    sealed = np.zeros((100, 60, 30), bool)
+    sealed[50:52] = True
+    plan(walled, START, GOAL, iterations=600)
+    plan(FieldSpace(local_map(sealed), radius_m=0.4), START, GOAL)
+    assert [len(kernel.signatures) for kernel in kernels] == before
