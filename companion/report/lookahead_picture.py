@@ -36,9 +36,10 @@ def draw_lookahead(rows: Sequence[LookaheadRow], best: LookaheadRow, file: Path)
             axes.plot(x, values, marker="o", markersize=4, label=name)
         axes.axvline(best.lookahead_s, color="0.4", linestyle="--", linewidth=1.0)
         axes.set_ylabel(title)
-        axes.set_ylim(bottom=min(0.0, *(v for _, values in curves for v in values)))
+        low, high = (f(0.0, *(v for _, values in curves for v in values)) for f in (min, max))
+        axes.set_ylim(low - 0.05 * (high - low), high + 0.1 * (high - low))
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper right")
+        axes.legend(loc="best")
     panels[-1].set_xlabel("lookahead, s at the present speed")
     s = best.score
     figure.suptitle(
