@@ -207,7 +207,7 @@ def test_a_wall_that_appears_ends_in_a_stop_before_it(flights, local_map):
     wall = round((flight.vehicle.p[0] + 4.5) / 0.2)
     occupied[wall : wall + 2] = True
     flight.obstacles = np.argwhere(occupied) * 0.2 + 0.1
-    flight.run(5.0)
+    flight.run(6.0)
     assert flight.status.state == "blocked"
     assert flight.speeds[-1] < 0.2 and flight.clearance_m > 0.15
 
