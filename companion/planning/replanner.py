@@ -19,6 +19,7 @@ from companion.planning.registry import make_planner
 from companion.planning.route import Route, RouteFinder, Spaces
 from companion.planning.smooth import smooth
 from companion.planning.space import FieldSpace
+from companion.planning.speed_profile import known_free_m, spacing_of
 from companion.planning.target import at_height
 
 State = Literal["idle", "flying", "reached", "blocked"]
@@ -285,5 +286,16 @@ class Replanner:
             points, _ = self.flown.ahead_until_stop
             s, _ = project(points, now.p_odom)
             self._still = self._still + 1 if length(points) - s < 0.3 else self._still
-        elif length(self.flown.ahead_until_stop[0]) > 2.0:
+        elif self._known_ahead_m(self.flown, now) > 2.0:
             self._still = 0
+
+    def _known_ahead_m(self, flown: Flown, now: Situation) -> float:
+        """Way ahead that is known free with all the clearance asked for: then creeping may end."""
+        assert self.goal is not None
+        if len(flown.points) < 2:
+            return 0.0
+        s, _ = project(flown.points, now.p_odom)
+        first = min(int(s / spacing_of(flown.points)), len(flown.points) - 1)
+        ahead = flown.points[first:]
+        radii_m = (self.hull_radius_m + self.goal.limits.clearance, self.hull_radius_m)
+        return min(known_free_m(ahead, now.local_map, self.config.speed, radii_m), length(ahead))
