@@ -291,10 +291,9 @@ class Replanner:
 
     def _known_ahead_m(self, flown: Flown, now: Situation) -> float:
         """Way ahead that is known free with all the clearance asked for: then creeping may end."""
-        assert self.goal is not None
-        if len(flown.points) < 2:
+        if self.goal is None or len(flown.points) < 2:
             return 0.0
-        s, _ = project(flown.points, now.p_odom)
+        s = project(flown.points, now.p_odom)[0]
         first = min(int(s / spacing_of(flown.points)), len(flown.points) - 1)
         ahead = flown.points[first:]
         radii_m = (self.hull_radius_m + self.goal.limits.clearance, self.hull_radius_m)
