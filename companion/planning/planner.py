@@ -6,8 +6,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +63,23 @@ class Plan:
     """`optimal`: no shorter way on the planner's lattice; `infeasible`: no way at the map's resolution."""
 
 
-class Planner(Protocol):
-    """Finds ways; an answer depends on the arguments alone."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Query:
+    """What a search is asked, of ends that are free; the words are those of `Planner.plan`."""
+
+    start: Array  # (3,), odom, m
+    goal: Array  # (3,)
+    space: CellSpace
+    rng: np.random.Generator
+    iterations: int
+    known_path: Array | None = None  # (N, 3)
+
+
+class Planner(ABC):
+    """Finds ways; an answer depends on the arguments alone. Those of one kind differ in `search`."""
+
+    straight_first: ClassVar[bool] = False
+    """Whether a free straight way is answered without a search."""
 
     def plan(
         self,
@@ -80,7 +96,15 @@ class Planner(Protocol):
         `iterations` bounds the samples; a search of a finite lattice ends by itself.
         `known_path` (N, 3) may help and need not be valid or fit the ends.
         """
-        ...
+        answer = (trivial if self.straight_first else refused)(start, goal, space)
+        if answer is not None:
+            return answer
+        query = Query(start=start, goal=goal, space=space, rng=rng, iterations=iterations, known_path=known_path)
+        return self.search(query)
+
+    @abstractmethod
+    def search(self, query: Query) -> Plan:
+        """The planner's own way of finding one."""
 
 
 def refused(start: Array, goal: Array, space: CellSpace) -> Plan | None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from companion.core.messages import Array
 from companion.planning.lazy_theta import COARSEST, LazyTheta
-from companion.planning.planner import CellSpace, Plan, trivial
+from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.reach import Reach
 from companion.planning.rrt_star import RRTStar, RRTStarConfig, Search
 
@@ -44,45 +44,32 @@ class PortfolioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Weight of the straight distance in the lattice while there is no way; then 1."""
 
 
-class Portfolio:
+class Portfolio(Planner):
     """Keeps only scratch memory, so a plan depends on its arguments alone."""
+
+    straight_first = True
 
     def __init__(self, config: PortfolioConfig, rrt_star: RRTStarConfig) -> None:
         self.config = config
         self._rrt_star, self._lattice = RRTStar(rrt_star), LazyTheta()
 
-    def plan(
-        self,
-        start: Array,
-        goal: Array,
-        space: CellSpace,
-        *,
-        rng: np.random.Generator,
-        iterations: int,
-        known_path: Array | None = None,
-    ) -> Plan:
+    def search(self, query: Query) -> Plan:
         """Shortest way found with at most `iterations` samples, in whole chunks; none: Plan.proof is `infeasible`.
 
         If a way exists it is found, however few the samples: the lattice ends by itself. With more iterations and
         the same `rng` state the cost never rises.
         """
-        answer = trivial(start, goal, space)
-        if answer is not None:
-            return answer
-        search = self.begin(start, goal, space, iterations=iterations, known_path=known_path)
-        while search.samples < iterations or not search.ended:
-            search.advance(rng)
+        search = self.begin(query)
+        while search.samples < query.iterations or not search.ended:
+            search.advance(query.rng)
             if search.infeasible:
                 break
         return search.result()
 
-    def begin(
-        self, start: Array, goal: Array, space: CellSpace, *, iterations: int, known_path: Array | None = None
-    ) -> PortfolioSearch:
+    def begin(self, query: Query) -> PortfolioSearch:
         """A search to be advanced in portions; it uses this planner's memory, so one at a time."""
-        tree = self._rrt_star.begin(start, goal, space, iterations=iterations, known_path=known_path)
-        ends = space.to_cells(np.stack([start, goal]))
-        return PortfolioSearch(self.config, tree, self._lattice, space, ends)
+        ends = query.space.to_cells(np.stack([query.start, query.goal]))
+        return PortfolioSearch(self.config, self._rrt_star.begin(query), self._lattice, query.space, ends)
 
 
 class PortfolioSearch:

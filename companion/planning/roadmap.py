@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from companion.core.messages import Array
-from companion.planning.planner import CellSpace, Plan, refused
+from companion.planning.planner import CellSpace, Plan, Planner, Query, refused
 from companion.planning.polyline import length, without_repeats
 from companion.planning.roadmap_bytes import pack, unpack
 from companion.planning.roadmap_search import links_free, pairs_free, route, way_back
@@ -174,9 +174,10 @@ def _nearest_pairs(points: Array, neighbours: int) -> NDArray[np.int64]:
     return different
 
 
-class PRM:
+class PRM(Planner):
     """Builds a roadmap of `iterations` samples for each plan: the map of a flight is a new one each time."""
 
+    straight_first = True
     star = False
 
     def __init__(self, config: RoadmapConfig) -> None:
@@ -184,26 +185,17 @@ class PRM:
         self.roadmap: Roadmap | None = None
         """Of the last plan."""
 
-    def plan(
-        self,
-        start: Array,
-        goal: Array,
-        space: CellSpace,
-        *,
-        rng: np.random.Generator,
-        iterations: int,
-        known_path: Array | None = None,
-    ) -> Plan:
+    def search(self, query: Query) -> Plan:
         """Shortest way along the roadmap; the points of `known_path` are places of it, too."""
-        refusal = refused(start, goal, space)
-        if refusal is not None:
-            return refusal
-        if space.segment_free(start, goal):
-            straight = np.stack([start, goal])
-            return Plan(path=straight, cost_m=length(straight), iterations=0, solved=True)
-        roadmap = build_roadmap(space, rng=rng, samples=iterations, config=self.config, star=self.star, more=known_path)
-        self.roadmap = roadmap
-        return replace(roadmap.query(start, goal, space), iterations=iterations)
+        self.roadmap = build_roadmap(
+            query.space,
+            rng=query.rng,
+            samples=query.iterations,
+            config=self.config,
+            star=self.star,
+            more=query.known_path,
+        )
+        return replace(self.roadmap.query(query.start, query.goal, query.space), iterations=query.iterations)
 
 
 class PRMStar(PRM):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from companion.core.messages import Array
 from companion.planning import connect as two_trees
 from companion.planning.grid import segment_free
-from companion.planning.planner import CellSpace, Plan, refused
+from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.polyline import length, without_repeats
 from companion.planning.tree import COST, PARENT, add, gap, nearest, way_to
 
@@ -39,7 +39,7 @@ class RRTConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Edge of the nearest-neighbour buckets."""
 
 
-class RRT:
+class RRT(Planner):
     """One tree from the start; the path is whatever branch meets the goal first."""
 
     def __init__(self, config: RRTConfig) -> None:
@@ -50,27 +50,16 @@ class RRT:
         """All edges (E, 2, 3) of the last plan's search, odom, m: for pictures."""
         return _edges(*self._last) if self._last else np.empty((0, 2, 3))
 
-    def plan(
-        self,
-        start: Array,
-        goal: Array,
-        space: CellSpace,
-        *,
-        rng: np.random.Generator,
-        iterations: int,
-        known_path: Array | None = None,
-    ) -> Plan:
+    def search(self, query: Query) -> Plan:
         """First way found with at most `iterations` samples; `known_path` changes nothing."""
-        refusal = refused(start, goal, space)
-        if refusal is not None:
-            return refusal
-        ends, trees = space.to_cells(np.stack([start, goal])), _Trees.of(1, iterations, space, self.config)
+        start, goal, space = query.start, query.goal, query.space
+        ends, trees = space.to_cells(np.stack([start, goal])), _Trees.of(1, query.iterations, space, self.config)
         trees.plant(0, ends[0])
         tree, step = (trees.nodes[0], trees.links[0], trees.heads[0]), self.config.step_m / space.resolution_m
         settings = np.array([step, self.config.goal_bias, trees.bucket])
         count, done, joined = 1, 0, False
-        while done < iterations and not joined:
-            draws = rng.random((min(_CHUNK, iterations - done), _DRAWS))
+        while done < query.iterations and not joined:
+            draws = query.rng.random((min(_CHUNK, query.iterations - done), _DRAWS))
             count, used, joined = _grow(space.steps, *tree, count, ends[1], space.sample_box, draws, settings)
             done += used
         self._last = trees, [count], space
@@ -78,7 +67,7 @@ class RRT:
         return _plan(space, trees, last, (start, goal), done, joined)
 
 
-class RRTConnect:
+class RRTConnect(Planner):
     """Two trees that grow towards each other."""
 
     def __init__(self, config: RRTConfig) -> None:
@@ -89,28 +78,17 @@ class RRTConnect:
         """All edges (E, 2, 3) of the last plan's search, odom, m: for pictures."""
         return _edges(*self._last) if self._last else np.empty((0, 2, 3))
 
-    def plan(
-        self,
-        start: Array,
-        goal: Array,
-        space: CellSpace,
-        *,
-        rng: np.random.Generator,
-        iterations: int,
-        known_path: Array | None = None,
-    ) -> Plan:
+    def search(self, query: Query) -> Plan:
         """First way found with at most `iterations` samples, in whole chunks; `known_path` changes nothing."""
-        refusal = refused(start, goal, space)
-        if refusal is not None:
-            return refusal
+        start, goal, space = query.start, query.goal, query.space
         ends, step = space.to_cells(np.stack([start, goal])), self.config.step_m / space.resolution_m
         reach = int(sum(space.steps.shape) / step) + 2  # nodes of one long extension
-        trees = _Trees.of(2, iterations * reach, space, self.config)
+        trees = _Trees.of(2, query.iterations * reach, space, self.config)
         for which in (0, 1):
             trees.plant(which, ends[which])
         counts, path, done, points = np.array([1, 1]), np.zeros((4096, 3)), 0, 0
-        while done < iterations and not points:
-            draws = rng.random((_CHUNK, two_trees.DRAWS))
+        while done < query.iterations and not points:
+            draws = query.rng.random((_CHUNK, two_trees.DRAWS))
             done += _CHUNK
             arguments = (counts, space.sample_box, draws, step, trees.bucket, path)
             points = two_trees.connect(space.steps, trees.nodes, trees.links, trees.heads, *arguments)

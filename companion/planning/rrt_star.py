@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from companion.core.messages import Array
 from companion.planning import connect as two_trees
 from companion.planning import grow, shortcut
-from companion.planning.planner import CellSpace, Plan, trivial
+from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.polyline import length, without_repeats
 from companion.planning.tree import COST, NEVER, PARENT, way_to
 from companion.planning.trees import FROM_GOAL, FROM_START, OWN, PATH_POINTS, Trees
@@ -52,8 +52,10 @@ class RRTStarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Edge of the nearest-neighbour buckets."""
 
 
-class RRTStar:
+class RRTStar(Planner):
     """Keeps only scratch memory, so a plan depends on its arguments alone."""
+
+    straight_first = True
 
     def __init__(self, config: RRTStarConfig) -> None:
         self.config = config
@@ -64,39 +66,26 @@ class RRTStar:
         """All edges (E, 2, 3) of the last plan's tree, odom, m: for pictures."""
         return self._last.edges() if self._last else np.empty((0, 2, 3))
 
-    def plan(
-        self,
-        start: Array,
-        goal: Array,
-        space: CellSpace,
-        *,
-        rng: np.random.Generator,
-        iterations: int,
-        known_path: Array | None = None,
-    ) -> Plan:
+    def search(self, query: Query) -> Plan:
         """Shortest way found with at most `iterations` samples (rounded up to whole chunks).
 
         `start`, `goal` (3,) odom; both must be free. `known_path` (N, 3), say the rest of the
         old path, need not be valid or fit the ends. With more iterations and the same `rng`
         state the cost never rises.
         """
-        answer = trivial(start, goal, space)
-        if answer is not None:
-            return answer
-        search = self._last = self.begin(start, goal, space, iterations=iterations, known_path=known_path)
+        search = self._last = self.begin(query)
         done = 0
-        while done < iterations:
-            search.advance(rng)
+        while done < query.iterations:
+            search.advance(query.rng)
             done += self.config.chunk
         return search.result(done)
 
-    def begin(
-        self, start: Array, goal: Array, space: CellSpace, *, iterations: int, known_path: Array | None = None
-    ) -> Search:
+    def begin(self, query: Query) -> Search:
         """A search with memory for so many samples; it uses this planner's memory, so one at a time."""
-        search = Search(self.config, space, self._scratch(space, iterations), start, goal)
-        if known_path is not None and len(known_path):
-            search.take_known(known_path)
+        memory = self._scratch(query.space, query.iterations)
+        search = Search(self.config, query.space, memory, query.start, query.goal)
+        if query.known_path is not None and len(query.known_path):
+            search.take_known(query.known_path)
         return search
 
     def _scratch(self, space: CellSpace, iterations: int) -> Trees:

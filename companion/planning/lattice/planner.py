@@ -15,7 +15,7 @@ from companion.core.messages import Array
 from companion.planning.lattice.grid import MOST_WEIGHT, Found, Lattice, Scratch
 from companion.planning.lattice.heuristics import Heuristic, admissible, heuristic_code
 from companion.planning.lattice.moves import Neighbours
-from companion.planning.planner import CellSpace, Plan, Proof, refused
+from companion.planning.planner import CellSpace, Plan, Planner, Proof, Query
 from companion.planning.polyline import length
 
 
@@ -32,7 +32,7 @@ class LatticeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Accept a bound that may exceed the true way; without it such settings are refused."""
 
 
-class AStar:
+class AStar(Planner):
     """The shortest way along neighbouring cells, from centre to centre but for the ends.
 
     Raises InputError for a heuristic that does not fit the neighbours.
@@ -48,20 +48,9 @@ class AStar:
         self.closed = np.empty((0, 3), np.int64)
         """Expanded cells (K, 3) of the last plan: for pictures."""
 
-    def plan(
-        self,
-        start: Array,
-        goal: Array,
-        space: CellSpace,
-        *,
-        rng: np.random.Generator,
-        iterations: int,
-        known_path: Array | None = None,
-    ) -> Plan:
+    def search(self, query: Query) -> Plan:
         """Ends by itself: `iterations`, `rng` and `known_path` change nothing. Plan.iterations are expansions."""
-        refusal = refused(start, goal, space)
-        if refusal is not None:
-            return refusal
+        start, goal, space = query.start, query.goal, query.space
         places = space.to_cells(np.stack([start, goal]))
         lattice = self._lattice(space)
         found = self._search(lattice, places, space)

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from companion.planning.planner import Query
 from companion.planning.portfolio import Portfolio, PortfolioConfig
 from companion.planning.rrt_star import RRTStar, RRTStarConfig
 from companion.runtime.bench.planners_worlds import World
@@ -67,8 +68,9 @@ def run_ours(machine: Portfolio | RRTStar, world: World, pair: int, *, seed: int
     """CPU time and length of every better way; checks the last by exact traversal."""
     start, goal = world.ends[pair]
     rng, trace = np.random.default_rng([seed, pair]), Trace()
+    query = Query(start=start, goal=goal, space=world.space, rng=rng, iterations=_MOST_SAMPLES)
     started = time.process_time()
-    search = machine.begin(start, goal, world.space, iterations=_MOST_SAMPLES)
+    search = machine.begin(query)
     spent = 0.0
     while spent < budget_s:
         search.advance(rng)
