@@ -29,7 +29,7 @@ DELAY_MS: dict[str, dict[str, float]] = {
     "LioNode": {"sensors/lidar": 15.0, "sensors/camera": 15.0},
     "GraphNode": {"estimation/likelihood": 8.0},
     "LoopNode": {"estimation/registered_scan": 250.0},
-    "MappingNode": {"estimation/registered_scan": 30.0},
+    "MappingNode": {"estimation/registered_scan": 42.0},
     "LandmarkNode": {"sensors/camera": 20.0},
     "PlanningNode": {"mapping/local_map": 40.0, "mission/goal": 40.0},
 }
