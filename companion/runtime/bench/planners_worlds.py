@@ -78,7 +78,8 @@ def _space(occupied: Occupied) -> CellSpace:
     return FieldSpace(freeze(local_map), radius_m=RADIUS_M)
 
 
-def _empty(*, plane: bool = False) -> Occupied:
+def empty_world(*, plane: bool = False) -> Occupied:
+    """Ground and nothing on it, or an empty plane."""
     side = round(_SIDE_M / RESOLUTION_M)
     if plane:
         return np.zeros((side, side), bool)
@@ -87,15 +88,15 @@ def _empty(*, plane: bool = False) -> Occupied:
     return occupied
 
 
-def _fill(occupied: Occupied, low: tuple[float, ...], high: tuple[float, ...], value: bool = True) -> None:
+def fill_box(occupied: Occupied, low: tuple[float, ...], high: tuple[float, ...], value: bool = True) -> None:
     """A box, m; a plane world takes the first two numbers."""
     part = [slice(max(round(a / RESOLUTION_M), 0), round(b / RESOLUTION_M)) for a, b in zip(low, high, strict=True)]
     occupied[tuple(part[: occupied.ndim])] = value
 
 
-def _forest(rng: np.random.Generator, trees_per_m2: float = 1 / 25, *, crowns: bool = True) -> Occupied:
+def forest(rng: np.random.Generator, trees_per_m2: float = 1 / 25, *, crowns: bool = True) -> Occupied:
     """Leaning trunks of 0.15 to 0.35 m radius; crowns of three balls each."""
-    occupied = _empty()
+    occupied = empty_world()
     for _ in range(rng.poisson(trees_per_m2 * _SIDE_M**2)):
         foot, radius = rng.uniform(0, _SIDE_M, 2), rng.uniform(0.15, 0.35)
         lean = np.tan(rng.uniform(0, np.radians(10))) * _direction(rng)
@@ -125,20 +126,20 @@ def _ball(occupied: Occupied, center: Array, radius: float) -> None:
 
 def _windows(rng: np.random.Generator) -> Occupied:
     """A thin forest behind two walls with one window of 1.6 m each, at opposite sides and heights."""
-    occupied = _forest(rng, 1 / 100, crowns=False)
+    occupied = forest(rng, 1 / 100, crowns=False)
     for x, y, z in ((22.0, 44.0, 7.0), (38.0, 14.0, 2.0)):
-        _fill(occupied, (x - 1.0, 0, 0), (x + 1.4, _SIDE_M, _HEIGHT_M), False)
-        _fill(occupied, (x, 0, 0), (x + 0.4, _SIDE_M, _HEIGHT_M))
-        _fill(occupied, (x, y - 0.8, z - 0.8), (x + 0.4, y + 0.8, z + 0.8), False)
+        fill_box(occupied, (x - 1.0, 0, 0), (x + 1.4, _SIDE_M, _HEIGHT_M), False)
+        fill_box(occupied, (x, 0, 0), (x + 0.4, _SIDE_M, _HEIGHT_M))
+        fill_box(occupied, (x, y - 0.8, z - 0.8), (x + 0.4, y + 0.8, z + 0.8), False)
     return occupied
 
 
 def _maze(rng: np.random.Generator) -> Occupied:
-    return _walls(_empty(), rng)
+    return _walls(empty_world(), rng)
 
 
 def _maze_2d(rng: np.random.Generator) -> Occupied:
-    return _walls(_empty(plane=True), rng)
+    return _walls(empty_world(plane=True), rng)
 
 
 def _walls(occupied: Occupied, rng: np.random.Generator) -> Occupied:
@@ -152,7 +153,7 @@ def _walls(occupied: Occupied, rng: np.random.Generator) -> Occupied:
             if occupied.ndim == 2 and luck < 1 / 12:
                 continue
             bottom, top = (0.0, 7.5) if luck < 1 / 12 else (2.6, _HEIGHT_M) if luck < 1 / 6 else (0.0, _HEIGHT_M)
-            _fill(occupied, (*low, bottom), (*high, top))
+            fill_box(occupied, (*low, bottom), (*high, top))
     return occupied
 
 
@@ -180,7 +181,7 @@ _ACROSS = (((1.5, 5, 1.2), (3, 55, 4)), ((57, 5, 1.2), (58.5, 55, 4)))  # low an
 _CORNERS = (((1, 1, 2), (4, 4, 8)), ((56, 56, 2), (59, 59, 8)))
 WORLDS: dict[str, tuple[str, Callable[[np.random.Generator], Occupied], tuple[tuple[tuple[float, ...], ...], ...]]] = {
     "maze_2d": ("maze in the plane, 60 x 60 m", _maze_2d, _CORNERS),
-    "forest": ("forest, 1 tree per 25 m2, 60 x 60 x 10 m", _forest, _ACROSS),
+    "forest": ("forest, 1 tree per 25 m2, 60 x 60 x 10 m", forest, _ACROSS),
     "windows": ("two walls with a window each", _windows, _ACROSS),
     "maze": ("maze in space", _maze, _CORNERS),
 }

@@ -24,11 +24,11 @@ from companion.runtime.bench.planners_worlds import (
     RESOLUTION_M,
     Occupied,
     World,
+    empty_world,
+    fill_box,
+    forest,
     make_world,
 )
-from companion.runtime.bench.planners_worlds import _empty as empty_world
-from companion.runtime.bench.planners_worlds import _fill as fill_box
-from companion.runtime.bench.planners_worlds import _forest as forest
 from companion.runtime.map_file import read_map
 
 PAIRS = 5  # of ends per world
