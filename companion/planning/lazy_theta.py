@@ -22,9 +22,13 @@ from companion.core.messages import Array
 from companion.planning.grid import JUMP_UNIT, segment_free
 from companion.planning.heap import pop, push
 from companion.planning.tree import COST, NEVER, gap
+from companion.planning.wave import FAR
 
 COARSEST = 3  # level n: lattice points 2^n cells apart
 State = Literal["open", "found", "exhausted"]
+Guide = tuple[NDArray[np.uint16], int, float]
+"""Layers of a `Wave` from the goal, (X, Y, Z), cells per block, and what share of them counts: waves are not round."""
+NO_GUIDE: Guide = np.zeros((0, 0, 0), np.uint16), 1, 1.0
 _PARENT, _VIA, _CELL = range(3)  # columns of links; nodes count from 1, 0: none
 _NODES, _LEFT, _LAST = range(3)  # of counts: nodes used, expansions left, node that sees the goal
 _OPEN, _FOUND, _EXHAUSTED, _FULL = range(4)
@@ -48,16 +52,23 @@ class LazyTheta:
         self._closed = np.zeros(nodes, np.bool_)
 
     def begin(
-        self, steps: NDArray[np.uint8], ends: Array, *, levels: tuple[int, int], weight: float, most: float = NEVER
+        self,
+        steps: NDArray[np.uint8],
+        ends: Array,
+        *,
+        levels: tuple[int, int],
+        weight: float,
+        most: float = NEVER,
+        guide: Guide = NO_GUIDE,
     ) -> None:
         """A new search from ends[0] to ends[1], (2, 3) cells, both free.
 
         `levels` = finest, coarsest (0 to COARSEST) in use. A `weight` above 1 makes the search greedy; only ways
-        shorter than `most` cells count.
+        shorter than `most` cells count. A `guide` that is too long hides ways.
         """
         self._forget(steps.size)
         self._steps, self._ends = steps, np.ascontiguousarray(ends, np.float64)
-        self._levels, self._bound = levels, (weight, most)
+        self._levels, self._bound, self._guide = levels, (weight, most), guide
         self._heap[2][0] = 0
         plant(steps, self._ends, weight, self._tree, self._heap, self._counts)
 
@@ -77,7 +88,7 @@ class LazyTheta:
         """Expand at most so many nodes more."""
         self._counts[_LEFT] = expansions
         while True:
-            world = (self._steps, self._ends, self._levels, self._bound)
+            world = (self._steps, self._ends, self._levels, self._bound, self._guide)
             code = expand(*world, self._tree, self._heap, self._counts)
             if code != _FULL:
                 return ("open", "found", "exhausted")[code]
@@ -122,7 +133,7 @@ def plant(steps, ends, weight, tree, heap, counts):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def expand(steps, ends, levels, bound, tree, heap, counts):  # type: ignore[no-untyped-def]
+def expand(steps, ends, levels, bound, guide, tree, heap, counts):  # type: ignore[no-untyped-def]
     """Expand nodes until the goal is in sight, none is left, memory is full or counts says stop.
 
     index (V,) node of a cell; nodes (C, 4) x, y, z, cost; links (C, 3); closed (C,); heap as in `heap`.
@@ -141,13 +152,23 @@ def expand(steps, ends, levels, bound, tree, heap, counts):  # type: ignore[no-u
         _settle(steps, v, level, tree)
         closed[v] = True
         counts[_LEFT] -= 1
-        if nodes[v, COST] + gap(nodes, v, ends, 1) >= bound[1]:
+        if nodes[v, COST] + _left(nodes, v, ends, guide) >= bound[1]:
             continue
         if segment_free(steps, nodes[v], ends[1]):
             counts[_LAST] = v
             return _FOUND
-        _offer(steps, ends, v, level, bound, tree, heap, counts)
+        _offer(steps, ends, v, level, bound, guide, tree, heap, counts)
     return _OPEN
+
+
+@njit(cache=True, nogil=True)
+def _left(nodes, v, ends, guide):  # type: ignore[no-untyped-def]
+    """About how far it is to the goal, cells: as the guide knows, at least straight."""
+    straight, (layers, block, share) = gap(nodes, v, ends, 1), guide
+    i, j, k = int(nodes[v, 0]) // block, int(nodes[v, 1]) // block, int(nodes[v, 2]) // block
+    if i >= layers.shape[0] or j >= layers.shape[1] or k >= layers.shape[2] or layers[i, j, k] == FAR:
+        return straight
+    return max(straight, share * block * layers[i, j, k])
 
 
 @njit(cache=True, nogil=True)
@@ -185,7 +206,7 @@ def _settle(steps, v, level, tree):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _offer(steps, ends, v, level, bound, tree, heap, counts):  # type: ignore[no-untyped-def]
+def _offer(steps, ends, v, level, bound, guide, tree, heap, counts):  # type: ignore[no-untyped-def]
     """Offer every neighbour of `v` the straight way from the parent of `v`."""
     index, nodes, links, closed = tree
     parent = links[v, _PARENT]
@@ -200,11 +221,11 @@ def _offer(steps, ends, v, level, bound, tree, heap, counts):  # type: ignore[no
                     continue
                 u = index[(x * steps.shape[1] + y) * steps.shape[2] + z]
                 if u == 0 or not closed[u]:
-                    _hang(steps, ends, (v, from_), (x, y, z), bound, tree, heap, counts)
+                    _hang(steps, ends, (v, from_), (x, y, z), bound, guide, tree, heap, counts)
 
 
 @njit(cache=True, nogil=True)
-def _hang(steps, ends, above, place, bound, tree, heap, counts):  # type: ignore[no-untyped-def]
+def _hang(steps, ends, above, place, bound, guide, tree, heap, counts):  # type: ignore[no-untyped-def]
     """The node of a cell hangs on `above`[1], found through `above`[0], if that is cheaper than before."""
     index, nodes, links, closed = tree
     cell = (place[0] * steps.shape[1] + place[1]) * steps.shape[2] + place[2]
@@ -217,7 +238,7 @@ def _hang(steps, ends, above, place, bound, tree, heap, counts):  # type: ignore
     cost = nodes[above[1], COST] + gap(nodes, above[1], nodes, u)
     if cost >= nodes[u, COST] - 1e-9:
         return
-    left = gap(nodes, u, ends, 1)
+    left = _left(nodes, u, ends, guide)
     if cost + left >= bound[1] or not segment_free(steps, nodes[above[0]], nodes[u]):
         return
     if u == new:

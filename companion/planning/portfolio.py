@@ -1,8 +1,9 @@
-"""Several planners that help each other: the straight line, RRT-Connect, a coarse-to-fine lattice, RRT*.
+"""Several planners that help each other: the straight line, RRT-Connect, a wave, a coarse-to-fine lattice, RRT*.
 
-A first way comes from RRT-Connect, which is fast where there is room. If a few samples do not find one, a flood fill
-says whether there is a way at all; if there is, Lazy Theta* looks for it from coarse to fine, beside RRT-Connect. From
-then on RRT* and shortcuts better the way, and the finer lattices look for shorter ones elsewhere.
+A first way comes from RRT-Connect, which is fast where there is room. If a few samples do not find one, a wave from the
+goal finds the way around all walls, unless that is narrower than two cells. Then a flood fill says whether there is a
+way at all, and Lazy Theta* looks for it from coarse to fine, beside RRT-Connect. From then on RRT* and shortcuts better
+the way, and the lattices, which the wave guides, look for shorter ones elsewhere.
 
 >>> planner = Portfolio(PortfolioConfig(), RRTStarConfig())
 >>> plan = planner.plan(start, goal, space, rng=np.random.default_rng(1), iterations=1000)
@@ -17,27 +18,31 @@ import msgspec
 import numpy as np
 
 from companion.core.messages import Array
-from companion.planning.lazy_theta import COARSEST, LazyTheta
+from companion.planning.lazy_theta import COARSEST, NO_GUIDE, LazyTheta
 from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.reach import Reach
 from companion.planning.rrt_star import RRTStar, RRTStarConfig, Search
+from companion.planning.wave import Wave
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
-_LEVELS = ((3, COARSEST), (2, COARSEST), (1, COARSEST), (0, COARSEST), (0, 0))
+_LEVELS = ((2, COARSEST), (1, COARSEST), (0, COARSEST), (0, 0))
 """Finest and coarsest lattice of the searches, one after the other; the last has every cell."""
-
+_BLOCK = 2  # cells; blocks that are free as a whole carry the wave
+_WAVE_SHARE = 0.94  # of a wave's layers: at most the distance
 _ROOM_COLUMNS = 4000  # columns of a small room, counted each time that it spreads
 
 
 class PortfolioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Who works how much."""
 
-    alone: Count = 400
-    """Samples of RRT-Connect before the lattice helps; if these find a way, the world counts as easy."""
+    alone: Count = 300
+    """Samples of RRT-Connect before a wave is sent, and then the lattice helps."""
     hard_expansions: Count = 400
-    """Expansions of the lattice per round in worlds that are not easy."""
+    """Expansions of the lattice per round while there is no way."""
+    guided_expansions: Count = 100
+    """And per round beside RRT*, in worlds where a wave was needed for the first way."""
     easy_expansions: Count = 40
-    """And in easy ones, beside RRT*."""
+    """And in easy ones."""
     first_shortcuts: Count = 200
     """Attempts to shorten what RRT-Connect or the lattice found."""
     greed: Annotated[float, msgspec.Meta(ge=1)] = 3.0
@@ -83,8 +88,10 @@ class PortfolioSearch:
         self._looking = False
         self._reach: Reach | None = None
         self._joined: bool | None = None  # do free cells lead to the goal? None: not known yet
+        self._is_swept = False  # was a wave sent?
+        self._guide = NO_GUIDE
         self._is_new = True  # the first way is not shortened yet
-        self.samples = self._samples_first = 0
+        self.samples = 0
 
     @property
     def solved(self) -> bool:
@@ -113,11 +120,10 @@ class PortfolioSearch:
         if self.solved:
             self._better(rng)
             return
-        self._samples_first = self.samples
         tree.first(rng)
         if self.solved:
             self._looking = False  # a greedy search is of no more use
-        elif self.samples >= config.alone and not self._is_enclosed():
+        elif self.samples >= config.alone and not self._is_enclosed() and not self._sweep(rng):
             self._look(config.hard_expansions, rng)
 
     def _better(self, rng: np.random.Generator) -> None:
@@ -125,10 +131,20 @@ class PortfolioSearch:
             self._is_new = False
             self._tree.shorten(rng, self._config.first_shortcuts)
             return
-        easy = self._samples_first <= self._config.alone
-        self._look(self._config.easy_expansions if easy else self._config.hard_expansions, rng)
+        config = self._config
+        self._look(config.guided_expansions if self._is_swept else config.easy_expansions, rng)
         self._tree.grow(rng)
         self._tree.shorten(rng)
+
+    def _sweep(self, rng: np.random.Generator) -> bool:
+        """Once: the way down a wave of coarse blocks, if it comes to the start."""
+        if self._is_swept:
+            return False
+        self._is_swept, wave = True, Wave(self._space.steps, self._ends, block=_BLOCK)
+        if wave.reached:
+            self._guide = np.ascontiguousarray(wave.layers), _BLOCK, _WAVE_SHARE
+            self._tree.offer(wave.path(), rng, self._config.first_shortcuts)
+        return self.solved
 
     def _look(self, expansions: int, rng: np.random.Generator) -> None:
         """Search on; a lattice that has ended makes room for the next finer one."""
@@ -150,7 +166,8 @@ class PortfolioSearch:
     def _begin_level(self) -> None:
         self._looking, most = True, self._tree.best_cost
         weight = 1.0 if self.solved else self._config.greed
-        self._lattice.begin(self._space.steps, self._ends, levels=self._levels[0], weight=weight, most=most)
+        steps, levels = self._space.steps, self._levels[0]
+        self._lattice.begin(steps, self._ends, levels=levels, weight=weight, most=most, guide=self._guide)
 
     def _is_enclosed(self) -> bool:
         """A small room around the goal is found at once; a large one when the coarsest lattice has found no way."""

@@ -10,6 +10,7 @@ from companion.planning.flown import with_speeds
 from companion.planning.registry import make_planner
 from companion.planning.smooth import smooth
 from companion.planning.space import FieldSpace, fill_ground
+from companion.planning.wave import Wave
 
 _ENCLOSED = np.array([3.5, 3.1, 1.1])  # a free cell between blocked ones
 
@@ -25,6 +26,7 @@ def warm_up(config: PlanningConfig, *, hull_radius_m: float) -> None:
     planner.plan(start, goal, space, rng=seed, iterations=500)  # RRT-Connect first
     plan = planner.plan(start, goal, space, rng=seed, iterations=500, known_path=goal[None])
     planner.plan(start, _ENCLOSED, space, rng=seed, iterations=500)  # a proof, of planners that give one
+    Wave(space.steps, space.to_cells(np.stack([start, goal])), block=1).path()
     path = smooth(plan.path, space, config.smooth)
     limits = Limits(
         speed=1.0,
@@ -55,7 +57,7 @@ def _wall() -> LocalMap:
     distance = np.full(state.shape, 2.0, np.float32)
     distance[9:12, 1:9] = 0.1
     distance[15:20, 13:18, 2:9] = 0.1
-    distance[17, 15, 5] = 2.0
+    distance[17, 15, 5] = 0.25
     ground = np.full((20, 20), np.nan, np.float32)
     ground[0, 0] = 0.0
     wall = LocalMap(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import label
 
-from companion.planning import connect, grow, lazy_theta, reach
+from companion.planning import connect, grow, lazy_theta, reach, wave
 from companion.planning.config import PlanningConfig
 from companion.planning.grid_space import GridSpace
 from companion.planning.polyline import length
@@ -125,6 +125,7 @@ def test_a_free_straight_line_is_the_optimum_and_costs_nothing(walled):
 
 def test_the_warm_up_compiles_every_kernel_that_a_plan_may_need(walled, local_map):
     kernels = (lazy_theta.plant, lazy_theta.expand, reach.flood, connect.connect, grow.grow, grow.add_chain)
+    kernels += (wave.find_free, wave.spread, wave.descend)
     warm_up(PlanningConfig(route=RouteConfig(planner="portfolio")), hull_radius_m=0.3)
     before = [len(kernel.signatures) for kernel in kernels]
     assert min(before) > 0
