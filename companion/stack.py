@@ -44,7 +44,8 @@ def build(
 ) -> list[Node]:
     """The nodes of the stack (or some of them), ready to be run by `companion.runtime`.
 
-    `shelf` takes what of the map is far away; None: that stays in memory.
+    Without a back end in `config.estimation` there is no GraphNode. `shelf` takes what of the map is far
+    away; None: that stays in memory.
     """
     makers: dict[type[Node], Callable[[], Node]] = {
         SensorsNode: lambda: SensorsNode(config.sensors),
@@ -60,7 +61,8 @@ def build(
         SafetyNode: lambda: SafetyNode(config.safety, fence=mission.fence),
         AutopilotNode: lambda: AutopilotNode(config.autopilot, signing_key=signing_key),
     }
-    return [makers[kind]() for kind in only]
+    without = () if config.estimation.back_end == "graph" else (GraphNode,)
+    return [makers[kind]() for kind in only if kind not in without]
 
 
 def warm(config: Config, nodes: Sequence[Node]) -> None:

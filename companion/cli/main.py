@@ -69,6 +69,7 @@ GROUPS = {  # group -> help, command -> module and function
         "Measure this machine.",
         {
             "bus": "bench:bus",
+            "estimators": "bench_estimators:estimators",
             "mapping": "bench_mapping:mapping",
             "planners": "bench_planners:planners",
             "planning": "bench_planning:planning",

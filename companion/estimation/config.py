@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -31,5 +31,6 @@ class EstimationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     camera: CameraConfig = CameraConfig()
     order: OrderConfig = OrderConfig()
     propagator: PropagatorConfig = PropagatorConfig()
+    back_end: Literal["graph", "none"] = "graph"  # none: the filter alone, for small computers; map stays odom
     graph: GraphConfig = GraphConfig()
     loops: LoopNodeConfig = LoopNodeConfig()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
 from companion.core.messages import Array
 from companion.estimation.filter import Filter, StartSigmas, start_covariance
+from companion.estimation.filters.unscented import UnscentedFilter
 from companion.estimation.so3 import tilt_free
 from companion.estimation.state import State
 
@@ -16,8 +17,9 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class StartConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When the vehicle counts as standing still, and what is then assumed."""
+    """When the vehicle counts as standing still, what is then assumed, and the filter that begins there."""
 
+    filter: Literal["ekf", "ukf"] = "ekf"  # error-state, linearised; or unscented: 36 sigma points
     rest_s: Positive = 1.0  # stand still for this long
     gyro_spread_rad_s: Positive = 0.03  # largest standard deviation of an axis
     accel_spread_m_s2: Positive = 0.3
@@ -45,7 +47,8 @@ def start_filter(samples: Array, config: StartConfig, *, t_s: float) -> Filter:
     state.gyro_bias[:] = rate
     state.accel_bias[:] = force * (1.0 - config.gravity_m_s2 / np.linalg.norm(force))
     P = start_covariance(state.R, tilt_sigma_m_s2=config.accel_bias_sigma_m_s2, sigmas=StartSigmas())
-    return Filter(state, P, t_s)
+    kind = UnscentedFilter if config.filter == "ukf" else Filter
+    return kind(state, P, t_s)
 
 
 def _without_yaw(R: Array) -> Array:

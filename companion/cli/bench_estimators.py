@@ -1,0 +1,95 @@
+"""`companion bench estimators`: filters, graph and Monte Carlo localisation on the same data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from companion.cli.bus_options import Json, say
+from companion.core.errors import InputError
+from companion.estimation.filters.interface import ESTIMATORS
+from companion.runtime.bench import estimators_real as real
+from companion.runtime.bench.estimator_row import EstimatorRow
+from companion.runtime.bench.estimators_warehouse import bench_warehouse
+from companion.runtime.inertial_recordings import flow_flight, kitti_drive, rtk_flights
+
+STUDIES = ("warehouse", "kitti", "rtk", "flow")
+_RTK, _FLOW = "imu_rtk_quadrotor_ansfl", "flow_imu_quad_inertialnav/quadOptFlowLogData.zip"
+
+
+def estimators(
+    study: Annotated[
+        list[str] | None, typer.Option("--study", help="This one; give it again for more. None: all there is data for.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option(help=f"Folder that holds {_RTK}/ and {_FLOW}.")] = None,
+    estimator: Annotated[
+        list[str] | None, typer.Option("--estimator", help="Of real recordings: ekf, ukf, graph; repeatable.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=200, help="Drives of each case of the warehouse.")] = 10,
+    out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare estimators on the same data. Example: companion bench estimators --study warehouse --seeds 20
+
+    warehouse: MCL against EKF in a simulated plan. kitti: gtsam's drive. rtk, flow: real flights, with --data.
+    JSON is also printed if standard output is no terminal.
+    """
+    if out is not None and not out.parent.is_dir():
+        raise InputError("no such folder", field="--out", file=str(out.parent))
+    names = _valid(estimator or list(ESTIMATORS), ESTIMATORS, "--estimator")
+    wanted = _valid(study or [s for s in STUDIES if data or s not in ("rtk", "flow")], STUDIES, "--study")
+    console, done = Console(), []
+    plain = as_json or not console.is_terminal
+    for row in _rows(wanted, names, data, seeds):
+        done.append(row)
+        if plain:
+            say(msgspec.json.encode(row).decode())
+        else:
+            console.print(table(row))
+        if out is not None:
+            out.write_bytes(msgspec.json.Encoder().encode_lines(done))
+
+
+def _rows(wanted: list[str], names: list[str], data: Path | None, seeds: int) -> Iterator[EstimatorRow]:
+    if "warehouse" in wanted:
+        yield from bench_warehouse(seeds)
+    if "kitti" in wanted:
+        yield from real.bench_fixes(real.KITTI, [kitti_drive(gtsam_data())], names)
+    if "rtk" in wanted:
+        yield from real.bench_fixes(real.RTK, real.rtk_recordings(rtk_flights(_folder(data) / _RTK)), names)
+    if "flow" in wanted:
+        yield from real.bench_flow(flow_flight(_folder(data) / _FLOW), names)
+
+
+def gtsam_data() -> Path:
+    """The folder of example data in gtsam's wheel."""
+    import gtsam
+
+    return Path(gtsam.__file__).parent / "Data"
+
+
+def table(row: EstimatorRow) -> Table:
+    """One row as people read it."""
+    shown = Table(title=f"{row.study}, {row.case}: {row.estimator}", title_justify="left", show_header=False)
+    for name, value in row.figures.items():
+        shown.add_row(name, "-" if value is None else f"{value:.3g}")
+    return shown
+
+
+def _folder(data: Path | None) -> Path:
+    if data is None:
+        raise InputError("needs recordings", field="--data", valid=f"the folder that holds {_RTK}/ and {_FLOW}")
+    return data
+
+
+def _valid(given: list[str], valid: tuple[str, ...], option: str) -> list[str]:
+    for one in given:
+        if one not in valid:
+            raise InputError(f"{one!r}", field=option, valid=", ".join(valid))
+    return given
