@@ -23,9 +23,8 @@ class ImuBuffer:
 
     def append(self, sample: ImuSample) -> bool:
         """Take a sample; False if it is not finite or not newer than the last one."""
-        w, f = sample.angular_velocity_body, sample.specific_force_body
-        finite = np.isfinite(w).all() and np.isfinite(f).all()
-        if not finite or not self._is_next(sample.stamp_ns):
+        values = np.concatenate([sample.angular_velocity_body, sample.specific_force_body])
+        if not np.isfinite(values).all() or not self._is_next(sample.stamp_ns):
             self.refused += 1
             return False
         if self._count == _CAPACITY:
@@ -34,8 +33,7 @@ class ImuBuffer:
             self._values[:half] = self._values[half:]
             self._count = half
         self._stamps[self._count] = sample.stamp_ns
-        self._values[self._count, :3] = w
-        self._values[self._count, 3:] = f
+        self._values[self._count] = values
         self._count += 1
         return True
 
@@ -86,7 +84,9 @@ class ImuBuffer:
         ends = np.minimum(stamps[first : last + 1], end_ns)
         ends[-1] = end_ns
         pieces = np.empty((len(ends), 7))
-        pieces[:, 0] = np.diff(ends, prepend=start_ns) * 1e-9
+        pieces[1:, 0] = ends[1:] - ends[:-1]
+        pieces[0, 0] = ends[0] - start_ns
+        pieces[:, 0] *= 1e-9
         pieces[:, 1:] = self._values[first : last + 1]
         return pieces if pieces[:, 0].max() <= _LONGEST_STEP_S else _split(pieces)
 

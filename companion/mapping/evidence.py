@@ -8,9 +8,9 @@ that the map can have held there.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 
+import lz4.block
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -59,13 +59,13 @@ def pack(values: Levels, steps: Steps) -> PackedEvidence:
     """
     codes, listed = np.empty((len(values), _PACKED), np.uint8), np.empty(values.size, np.int8)
     count = _pack(values, _codes(steps), codes, listed)
-    return PackedEvidence(len(values), _deflate(codes), _deflate(listed[:count]))
+    return PackedEvidence(len(values), _packed(codes), _packed(listed[:count]))
 
 
 def unpack(packed: PackedEvidence, steps: Steps) -> Levels:
     """Evidence (N, 512)."""
-    codes = np.frombuffer(bytearray(zlib.decompress(packed.codes, -zlib.MAX_WBITS)), np.uint8)
-    listed = np.frombuffer(bytearray(zlib.decompress(packed.listed, -zlib.MAX_WBITS)), np.int8)
+    codes = np.frombuffer(bytearray(lz4.block.decompress(packed.codes)), np.uint8)
+    listed = np.frombuffer(bytearray(lz4.block.decompress(packed.listed)), np.int8)
     values = np.empty((packed.count, CELLS), np.int8)
     _unpack(codes.reshape(-1, _PACKED), listed, _levels(steps), values)
     return values
@@ -97,9 +97,9 @@ def _codes(steps: Steps) -> NDArray[np.uint8]:
     return codes
 
 
-def _deflate(array: NDArray[np.generic]) -> bytes:
-    packer = zlib.compressobj(1, zlib.DEFLATED, -zlib.MAX_WBITS, 9, zlib.Z_RLE)  # strings hardly come twice
-    return packer.compress(array.tobytes()) + packer.flush()
+def _packed(array: NDArray[np.generic]) -> bytes:
+    data: bytes = lz4.block.compress(array.tobytes())
+    return data
 
 
 @njit(cache=True, nogil=True)

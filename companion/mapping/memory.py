@@ -70,6 +70,7 @@ class Memory:
         self._keep = int(min(np.ceil(config.keep_m / (BLOCK * resolution_m)), 1 << 20))  # blocks
         self._asked: Box = (np.zeros(3, np.int64), np.zeros(3, np.int64))
         self._start: NDArray[np.int64] | None = None  # block of the first scan
+        self._settled_at: tuple[int, ...] = ()  # block and reach of the last scan, if it left nothing to move
         self._scarce = False
 
     @property
@@ -99,6 +100,9 @@ class Memory:
 
     def before_scan(self, here: NDArray[np.int64], reach: int) -> None:
         """Bring back all blocks of the ball of `reach` blocks around block `here` (3,); then move a few regions."""
+        place = (*here.tolist(), reach)
+        if place == self._settled_at:
+            return
         self._start = here if self._start is None else self._start
         self._scarce = self._total() > self.config.budget_mb * 1e6 * (_RELAXED if self._scarce else 1.0)
         keep, few = 0 if self._scarce else self._keep, self.config.regions_per_scan
@@ -110,6 +114,8 @@ class Memory:
         moved = self._put_away(here, reach + keep, few)
         if self._scarce and moved < few:
             self._forget(here)
+        settled = moved == 0 and ahead - must <= few and not self._scarce
+        self._settled_at = place if settled else ()
 
     def bring_back(self, box: Box) -> None:
         """Make sure that all blocks of the box are in the store, and stay until another box is asked for."""
@@ -138,9 +144,10 @@ class Memory:
     def log_odds_of(self, block_xyz: NDArray[np.int64]) -> NDArray[np.int8]:
         """Log-odds (N, 512) of the blocks at (N, 3), cold or not; UNKNOWN where there is none."""
         rows = self._blocks.rows_of(block_xyz)
-        found = np.full((len(rows), CELLS), UNKNOWN, np.int8)
-        found[rows >= 0] = self._blocks.log_odds[rows[rows >= 0]]
-        where = np.flatnonzero(rows < 0) if self.cold.regions else _NO_ROWS
+        found = self._blocks.log_odds[rows]
+        missing = np.flatnonzero(rows < 0)
+        found[missing] = UNKNOWN
+        where = missing if self.cold.regions else _NO_ROWS
         for part, blocks in self._met(block_xyz[where]):
             row = np.searchsorted(places_of(blocks["xyz"]), places_of(block_xyz[where[part]]))
             there = _same_place(blocks, row, block_xyz[where[part]])

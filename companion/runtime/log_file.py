@@ -117,8 +117,7 @@ class LogFile:
 
     def _write(self, entry: tuple[Any, ...]) -> None:
         data = self._pack(entry)
-        self._file.write(len(data).to_bytes(4, "little"))
-        self._file.write(data)
+        self._file.write(len(data).to_bytes(4, "little") + data)
 
 
 def read_log(path: Path) -> Iterator[list[Any]]:

@@ -39,13 +39,17 @@ def mip_levels(tile: Bytes2D) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
 
 @njit(cache=True, nogil=True)
 def _sample(flat, starts, x_px, y_px, footprint_px):  # type: ignore[no-untyped-def]
-    """Trilinear lookup at tile coordinates (texel k covers [k, k + 1)), for pixels of `footprint_px`."""
-    lod = min(max(np.log2(max(footprint_px, 1e-3)), 0.0), LEVELS - 1.0)
-    level = int(lod)
+    """Lookup at tile coordinates (texel k covers [k, k + 1)), for pixels of `footprint_px`.
+
+    Bilinear in two levels, and between them linear in the footprint: a logarithm per pixel would cost as much again.
+    """
+    level, texels = 0, footprint_px
+    while texels >= 2.0 and level < LEVELS - 1:
+        level, texels = level + 1, 0.5 * texels
     low = _bilinear(flat, starts, x_px, y_px, level)
-    if lod - level < 1e-3:
+    if texels < 1.001 or level == LEVELS - 1:
         return low
-    return low + (lod - level) * (_bilinear(flat, starts, x_px, y_px, level + 1) - low)
+    return low + (texels - 1.0) * (_bilinear(flat, starts, x_px, y_px, level + 1) - low)
 
 
 @njit(cache=True, nogil=True)
