@@ -31,7 +31,7 @@ from companion.mapping.cold_region import (
     regions_of,
 )
 from companion.mapping.cold_store import Box, ColdStore
-from companion.mapping.rays import BLOCK, CELLS
+from companion.mapping.rays import BLOCK
 from companion.mapping.sensor_model import UNKNOWN
 from companion.mapping.shelf import Shelf
 
