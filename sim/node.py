@@ -188,6 +188,7 @@ def _obstacles(world: World) -> Obstacles:
         origin_xy=world.origin_xy,
         cell_m=world.cell_m,
         walkers=world.walkers,
+        walls=world.walls,
     )
 
 

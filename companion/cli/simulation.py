@@ -10,11 +10,14 @@ import numpy as np
 from rich.console import Console
 
 from companion.config import apply_overrides_to, dump_struct
+from companion.core.messages import Array
 from companion.report.flight_figure import Scenery
 from sim.config import SimConfig
 from sim.node import SimNode
 from sim.sensors.render import InlineRenderer, NoRenderer, Renderer, WorkerRenderer
 from sim.world import World, load_world
+
+_OUTLINE_M = 1.0  # above ground: where a picture from above cuts the walls
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,24 @@ def scenery_of(world: World) -> Scenery:
         contour_x=world.origin_xy[0] + world.cell_m * np.arange(nx),
         contour_y=world.origin_xy[1] + world.cell_m * np.arange(ny),
         ground_z=world.heights,
+        wall_xy=_outline(world),
     )
+
+
+def _outline(world: World) -> Array:
+    """Where walls cross the height of flight, from above: segments (S, 2, 2), m."""
+    corners = world.walls.corners
+    xy = corners[..., :2]
+    above = corners[..., 2] - world.ground_z(xy[..., 0], xy[..., 1]) - _OUTLINE_M
+    ends = []
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        crosses = (above[:, a] < 0) != (above[:, b] < 0)
+        share = above[:, a] / np.where(crosses, above[:, a] - above[:, b], np.nan)
+        ends.append(xy[:, a] + share[:, None] * (xy[:, b] - xy[:, a]))
+    points = np.stack(ends, axis=1)
+    crossed = np.isfinite(points[..., 0])
+    two = crossed.sum(axis=1) == 2
+    return np.asarray(points[two][crossed[two]].reshape(-1, 2, 2))
 
 
 @contextmanager

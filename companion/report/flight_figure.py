@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from companion.report import style
 from companion.report.summary import aligned
 from companion.report.tracks import Track, Tracks
 
+_FLAT_M = 0.1  # a floor this even has no contour lines
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenery:
@@ -30,6 +32,7 @@ class Scenery:
     contour_x: Array  # (X,)
     contour_y: Array  # (Y,)
     ground_z: Array  # (X, Y)
+    wall_xy: Array = field(default_factory=lambda: np.empty((0, 2, 2)))  # where walls cross the height of flight
 
 
 def draw_flight(path: Path, tracks: Tracks, scenery: Scenery, title: str) -> None:
@@ -59,16 +62,9 @@ def headline(mission: str, world: str, seed: int, failure: str, figures: Mapping
 
 def _from_above(figure: Figure, axes: Axes, tracks: Tracks, scenery: Scenery, estimate: Track, truth: Track) -> None:
     box = _frame(truth.p, margin=6.0)
-    relief = axes.contour(
-        scenery.contour_x,
-        scenery.contour_y,
-        scenery.ground_z.T,
-        levels=12,
-        colors=style.GROUND,
-        linewidths=0.7,
-    )
-    axes.clabel(relief, fmt="%.1f m", fontsize=6)
+    _relief(axes, scenery)
     _trunks(axes, scenery)
+    axes.add_collection(LineCollection(list(scenery.wall_xy), colors=style.TRUNK, lw=1.0, zorder=3))
     _plans(axes, tracks, 0, 1)
     axes.plot(truth.p[:, 0], truth.p[:, 1], color=style.BLACK, lw=2.4, label="true path", zorder=4)
     lines = _coloured(axes, estimate, truth, 0, 1)
@@ -80,6 +76,15 @@ def _from_above(figure: Figure, axes: Axes, tracks: Tracks, scenery: Scenery, es
     _legend_above(axes)
     style.north_arrow(axes)
     style.scale_bar(axes, 10.0)
+
+
+def _relief(axes: Axes, scenery: Scenery) -> None:
+    if np.ptp(scenery.ground_z) < _FLAT_M:
+        return
+    relief = axes.contour(
+        scenery.contour_x, scenery.contour_y, scenery.ground_z.T, levels=12, colors=style.GROUND, linewidths=0.7
+    )
+    axes.clabel(relief, fmt="%.1f m", fontsize=6)
 
 
 def _trunks(axes: Axes, scenery: Scenery) -> None:

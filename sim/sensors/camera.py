@@ -21,7 +21,7 @@ from companion.core.rig import Mount, Pinhole
 from sim.sensors.caster import Caster
 from sim.sensors.texture import _sample, load_tile, mip_levels
 from sim.sensors.walker_rays import WalkerRays
-from sim.world.mesh import GROUND, TRUNK, Mesh
+from sim.world.mesh import GROUND, TRUNK, WALL, Mesh
 from sim.world.walkers import NOBODY, Walkers
 
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -119,13 +119,13 @@ def _vignette(pinhole: Pinhole, loss: float) -> Array32:
 
 
 def _shade_of(mesh: Mesh) -> Array32:
-    """Brightness per triangle (T,): trunks and branches by the light, leaves at random, ground 1."""
+    """Brightness per triangle (T,): trunks, branches and walls by the light, leaves at random, ground 1."""
     corners = mesh.vertices[mesh.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     light = np.asarray(_LIGHT, np.float32)
     length = np.maximum(np.linalg.norm(normal, axis=1) * np.linalg.norm(light), 1e-12)
     shade = 0.55 + 0.45 * np.abs(normal @ light) / length
-    leaf = mesh.classes > TRUNK
+    leaf = (mesh.classes > TRUNK) & (mesh.classes != WALL)
     shade[leaf] *= np.random.default_rng(0).uniform(0.5, 1.5, int(leaf.sum())).astype(np.float32)
     shade[mesh.classes == GROUND] = 1.0
     return np.asarray(shade, np.float32)
@@ -185,7 +185,8 @@ def _smooth(far, ids, classes, i, j):  # type: ignore[no-untyped-def]
             return False
     if same:
         return True
-    return classes[first] <= TRUNK and high < (1.2 if classes[first] == GROUND else 1.03) * low
+    solid = classes[first] <= TRUNK or classes[first] == WALL
+    return solid and high < (1.2 if classes[first] == GROUND else 1.03) * low
 
 
 @njit(cache=True, nogil=True)

@@ -128,7 +128,7 @@ class InlineRenderer(_Base):
 
     def __init__(self, world: World, lidar: LidarConfig, camera: CameraConfig, rig: Rig, *, seed: int) -> None:
         self.cpu_s = {"lidar": 0.0, "camera": 0.0}
-        self._sensors = Sensors(RenderSetup(world.mesh, lidar, camera, rig, seed, world.walkers))
+        self._sensors = Sensors(RenderSetup(world.mesh, lidar, camera, rig, seed, world.walkers, world.air))
         self._sensors.warm()
 
     @property
@@ -167,7 +167,7 @@ class WorkerRenderer(_Base):
     ) -> None:
         self.cpu_s = {"lidar": 0.0, "camera": 0.0}
         self._most_waiting = most_waiting
-        self._worker = Worker(RenderSetup(world.mesh, lidar, camera, rig, seed, world.walkers), self.cpu_s)
+        self._worker = Worker(RenderSetup(world.mesh, lidar, camera, rig, seed, world.walkers, world.air), self.cpu_s)
 
     def wait_ready(self) -> None:
         """Block until the worker has built and compiled everything; raises RenderError."""

@@ -1,4 +1,4 @@
-"""Hull against trunks, branches, walkers and ground: signed clearances at the physics rate.
+"""Hull against trunks, branches, walls, walkers and ground: signed clearances at the physics rate.
 
 The hull is a set of spheres; trunks and branches are solid cone frusta, the ground a height
 field. Cones near the aircraft are kept in a list that is made anew from a grid only after it
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -19,10 +20,11 @@ from companion.core.messages import Array
 from sim.world.reach import ConeGrid, grid_of
 from sim.world.terrain import _height
 from sim.world.walkers import NOBODY, Walkers, feet_of
+from sim.world.walls import NO_WALLS, Walls, point_to_triangle
 
 REACH_M = 4.0  # clearances are measured up to here; "nothing within reach" reads as this
 _SKIN_M = 1.0
-CONTACTS = ("", "trunk", "branch", "ground", "walker")
+CONTACTS = ("", "trunk", "branch", "ground", "walker", "wall")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,7 @@ class Obstacles:
     origin_xy: Array  # (2,)
     cell_m: float
     walkers: Walkers = NOBODY
+    walls: Walls = NO_WALLS  # surfaces: a hull is either clear of them or touches them
 
     def __post_init__(self) -> None:
         if self.cones.ndim != 2 or self.cones.shape[1] != 9 or len(self.kinds) != len(self.cones):
@@ -61,6 +64,16 @@ def flat_ground(z_m: float = 0.0, *, half_size_m: float = 200.0) -> Obstacles:
 def frustum_distance(cone: Array, point: Array) -> float:
     """Signed distance of a point (3,) to a solid frustum (9,), m; negative inside."""
     return float(_frustum_distance(cone, point[0], point[1], point[2]))
+
+
+class NearWalls:
+    """Walls near the aircraft and the scratch space to find them, as `Near` for cones."""
+
+    def __init__(self, walls: Walls) -> None:
+        center: Array = np.full(3, np.nan)  # about which the list was made
+        near = np.zeros(len(walls) + 1, np.int64)  # [0]: how many
+        seen = np.zeros(len(walls) + 1, np.int64)  # [-1]: number of the search
+        self.arguments: tuple[Any, ...] = walls.tables(), center, near, seen  # of the kernel
 
 
 class Near:
@@ -140,6 +153,58 @@ def _walker_clearance(x, spheres, walkers, time_s, best):  # type: ignore[no-unt
             best = min(best, gap)
             touched = touched or gap <= 0.0
     return best, touched
+
+
+@njit(cache=True, nogil=True)
+def _wall_clearance(x, spheres, walls, best):  # type: ignore[no-untyped-def]
+    """Lowers `best` if a wall is nearer; also whether one is touched.
+
+    The nearest wall comes first in the list: mostly it is again, and then the others cost little.
+    """
+    (corners, balls, frame, start, items), center, near, seen = walls
+    reach = _hull_reach(spheres)
+    dx, dy, dz = x[0] - center[0], x[1] - center[1], x[2] - center[2]
+    if not dx * dx + dy * dy + dz * dz < _SKIN_M * _SKIN_M:
+        _gather_walls(x, (balls, frame, start, items), center, near, seen, reach + REACH_M + _SKIN_M)
+    touched = False
+    for k in range(1, near[0] + 1):
+        t = near[k]
+        bx, by, bz = balls[t, 0] - x[0], balls[t, 1] - x[1], balls[t, 2] - x[2]
+        room = best + reach + balls[t, 3]
+        if bx * bx + by * by + bz * bz >= room * room:
+            continue
+        for s in range(spheres.shape[0]):
+            px, py, pz = _to_world(x, spheres[s])
+            gap = point_to_triangle(corners[t], px, py, pz) - spheres[s, 3]
+            if gap < best:
+                best = gap
+                near[1], near[k] = near[k], near[1]
+                touched = touched or gap <= 0.0
+    return best, touched
+
+
+@njit(cache=True, nogil=True)
+def _gather_walls(x, walls, center, near, seen, reach):  # type: ignore[no-untyped-def]
+    """Fill `near` with the walls within reach of the body's origin."""
+    balls, frame, start, items = walls
+    center[0], center[1], center[2] = x[0], x[1], x[2]
+    seen[-1] += 1
+    near[0] = 0
+    nx, ny = int(frame[2]), int(frame[3])
+    i0, i1 = max(math.floor(x[0] - reach - frame[0]), 0), min(math.floor(x[0] + reach - frame[0]), nx - 1)
+    j0, j1 = max(math.floor(x[1] - reach - frame[1]), 0), min(math.floor(x[1] + reach - frame[1]), ny - 1)
+    if j1 < j0:
+        return
+    for i in range(i0, i1 + 1):
+        for k in range(start[i * ny + j0], start[i * ny + j1 + 1]):
+            t = items[k]
+            if seen[t] == seen[-1]:
+                continue
+            seen[t] = seen[-1]
+            bx, by, bz = balls[t, 0] - x[0], balls[t, 1] - x[1], balls[t, 2] - x[2]
+            if math.sqrt(bx * bx + by * by + bz * bz) - balls[t, 3] < reach:
+                near[0] += 1
+                near[near[0]] = t
 
 
 @njit(cache=True, nogil=True)

@@ -15,10 +15,12 @@ from sim.vehicle.contact import (
     CONTACTS,
     REACH_M,
     Near,
+    NearWalls,
     Obstacles,
     _cone_clearance,
     _ground_clearance,
     _walker_clearance,
+    _wall_clearance,
 )
 from sim.vehicle.dynamics import STATE_SIZE, STEP_NS, STEP_S, _power, _rk4, _rotation, _volts
 from sim.vehicle.gear import _settle_anchors
@@ -56,6 +58,7 @@ class Vehicle:
         self._wind = pack_wind(wind)
         self._gust = self._rng.standard_normal(3)
         self._near = Near(obstacles)
+        self._walls = NearWalls(obstacles.walls).arguments
         self._walkers = obstacles.walkers.tables()
         self._heights: Array = np.ascontiguousarray(obstacles.heights, dtype=np.float64)
         self._field = np.array([obstacles.origin_xy[0], obstacles.origin_xy[1], obstacles.cell_m])
@@ -79,7 +82,8 @@ class Vehicle:
         _advance(
             self._x, self._model, command, self._rng.standard_normal((n_steps, 3)), self._wind, self._gust,
             self._heights, self._field, self._spheres, near.cones, near.kinds, near.frame, near.grid.start,
-            near.grid.items, near.list, near.seen, self._walkers, self._anchors, self._scalars, self._ring, self._work,
+            near.grid.items, near.list, near.seen, self._walkers, self._walls, self._anchors, self._scalars, self._ring,
+            self._work,
         )  # fmt: skip
 
     def weaken_rotor(self, rotor: int, loss: float) -> None:
@@ -146,7 +150,7 @@ class Vehicle:
 
     @property
     def contact(self) -> str:
-        """What the hull hit ("trunk", "branch", "ground", "walker"), or ""."""
+        """What the hull hit ("trunk", "branch", "ground", "walker", "wall"), or ""."""
         return CONTACTS[int(self._scalars[_CONTACT])]
 
     @property
@@ -160,7 +164,7 @@ class Vehicle:
         return float(self._scalars[_GROUND])
 
     def take_min_clearance(self) -> float:
-        """Smallest clearance of hull to trunks, branches and walkers since the last call, m, at most REACH_M."""
+        """Smallest clearance of hull to trunks, branches, walkers and walls since the last call, m, at most REACH_M."""
         smallest = float(self._scalars[_CLEARANCE])
         self._scalars[_CLEARANCE] = REACH_M
         return smallest
@@ -186,7 +190,7 @@ class Vehicle:
 @njit(cache=True, nogil=True)
 def _advance(  # type: ignore[no-untyped-def]
     x, model, command, normals, wind, gust, heights, field, spheres,
-    cones, kinds, frame, start, items, near, seen, walkers, anchors, scalars, ring, work,
+    cones, kinds, frame, start, items, near, seen, walkers, walls, anchors, scalars, ring, work,
 ):  # fmt: skip
     """One physics step per row of `normals`."""
     m = model[0]
@@ -219,6 +223,9 @@ def _advance(  # type: ignore[no-untyped-def]
             time_s = scalars[_STEPS] * STEP_S
             scalars[_CLEARANCE], touched = _walker_clearance(x, spheres, walkers, time_s, scalars[_CLEARANCE])
             kind = 4 if touched else 0
+        if kind == 0 and walls[0][0].shape[0] > 0:
+            scalars[_CLEARANCE], touched = _wall_clearance(x, spheres, walls, scalars[_CLEARANCE])
+            kind = 5 if touched else 0
         scalars[_GROUND] = _ground_clearance(x, spheres, heights, field[:2], field[2])
         crashed = scalars[_GROUND] <= 0.0 or (scalars[_STANDING] > 0 and _too_hard(m, x))
         scalars[_CONTACT] = kind if kind > 0 else 3 if crashed else 0

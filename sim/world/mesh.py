@@ -1,4 +1,4 @@
-"""Triangles of a world for ray casting: ground, trunks, branches, leaves, in this order."""
+"""Triangles of a world for ray casting: ground, trunks, branches, leaves, walls, in this order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.core.messages import Array, Array32
 
-GROUND, TRUNK, BRANCH, LEAF = range(4)  # classes of triangles
+GROUND, TRUNK, BRANCH, LEAF, WALL = range(5)  # classes of triangles
 _SIDES = {TRUNK: 12, BRANCH: 4}
 
 
@@ -74,6 +74,11 @@ def leaf_mesh(centers: Array, size_m: float, rng: np.random.Generator) -> Mesh:
     """One random triangle of about `size_m` around each centre (L, 3)."""
     corners = centers[:, None] + rng.normal(0.0, 0.5 * size_m, (len(centers), 3, 3))
     return _mesh(corners.reshape(-1, 3), np.arange(3 * len(centers)).reshape(-1, 3), LEAF, 0.3 * size_m)
+
+
+def wall_mesh(corners: Array) -> Mesh:
+    """Triangles (T, 3, 3) of racks, halls and rock."""
+    return _mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), WALL, np.inf)
 
 
 def _mesh(vertices: Array, triangles: NDArray[np.int64], kind: int, widths_m: Array | float) -> Mesh:

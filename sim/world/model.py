@@ -13,6 +13,7 @@ from sim.world.mesh import Mesh
 from sim.world.reach import ConeGrid, first_hit
 from sim.world.terrain import heights_at
 from sim.world.walkers import NOBODY, Walkers
+from sim.world.walls import NO_WALLS, Walls
 
 TRUNK_CONE, BRANCH_CONE = 0, 1
 
@@ -31,6 +32,18 @@ class Stems:
         return len(self.x)
 
 
+@dataclass(frozen=True)
+class Air:
+    """What light and air leave of the sensors; see sim/world/spec.py."""
+
+    light: float = 1.0
+    dust: float = 0.0
+    lidar_loss: float = 0.0
+
+
+CLEAR = Air()
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """World frame: ENU, z up, origin at the start on the ground. Arrays are read-only."""
@@ -47,6 +60,8 @@ class World:
     mesh: Mesh
     grid: ConeGrid  # which cones touch which square metre
     walkers: Walkers = NOBODY  # what moves; everything else stands still
+    walls: Walls = NO_WALLS  # racks, halls, rock
+    air: Air = CLEAR
 
     def ground_z(self, x: Array | float, y: Array | float) -> Array:
         """Ground height, m, in the shape of x and y; beyond the field that of its rim."""
@@ -57,11 +72,12 @@ class World:
     def range_to_surface(
         self, p_world: Array, direction: Array, *, max_range_m: float = 60.0, stamp_ns: int | None = None
     ) -> float:
-        """Distance from p along a unit direction to ground, trunk or branch; inf: none in range.
+        """Distance from p along a unit direction to ground, trunk, branch or wall; inf: none in range.
 
         With `stamp_ns` the walkers count, too, where they are at that time.
         """
         still_m = first_hit(self, p_world, direction, max_range_m)
+        still_m = min(still_m, self.walls.first_hit(p_world, direction, min(still_m, max_range_m)))
         if stamp_ns is None or not len(self.walkers):
             return still_m
         walker_m = self.walkers.first_hit(p_world, direction, stamp_ns)

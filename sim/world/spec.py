@@ -1,7 +1,8 @@
 """What a world is made of: one strict struct per kind, read from YAML or from `key=value` options.
 
 Leaves exist only above `crown_base_m`; a tree that is not higher carries none. Trunks and
-branches are obstacles for the hull and for the sensors, leaves for the sensors alone.
+branches are obstacles for the hull and for the sensors, leaves for the sensors alone; racks,
+halls and rock are obstacles for both.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from companion.core.errors import InputError
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Span = tuple[NotNegative, NotNegative]
 
 
@@ -42,6 +44,9 @@ class EmptySpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     walker_reach_m: Annotated[float, msgspec.Meta(ge=6, le=250)] = 20.0  # drawn ways lie so near to the start in x, y
     walker_turns: Annotated[int, msgspec.Meta(ge=0, le=10)] = 1  # corners of a drawn way between its ends
     walker_start_gap_m: NotNegative = 3.0  # how far they keep off the start
+    light: Share = 1.0  # what the camera gets of daylight
+    dust: Share = 0.0  # share of the LiDAR's beams that dust 0.5 to 3 m away returns
+    lidar_loss: Share = 0.0  # share of its returns that are lost besides the sensor's own
 
 
 class TreesSpec(EmptySpec, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -79,8 +84,51 @@ class StemsSpec(TreesSpec, frozen=True, forbid_unknown_fields=True, kw_only=True
     plot: int | str | None = None  # which one, if the file holds several
 
 
-WorldSpec = EmptySpec | PoissonSpec | StemsSpec
-KINDS: dict[str, type[EmptySpec]] = {"empty": EmptySpec, "poisson": PoissonSpec, "stems": StemsSpec}
+class WarehouseSpec(EmptySpec, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="warehouse"):
+    """Racks in a hall; its size follows from them."""
+
+    roughness_m: Annotated[float, msgspec.Meta(ge=0, le=5)] = 0.003
+    margin_m: Annotated[float, msgspec.Meta(ge=2, le=200)] = 2.0
+    rack_rows: Annotated[int, msgspec.Meta(ge=1, le=40)] = 5
+    bays: Annotated[int, msgspec.Meta(ge=1, le=60)] = 12  # along a rack
+    bay_m: Annotated[float, msgspec.Meta(ge=1, le=6)] = 2.8
+    levels: Annotated[int, msgspec.Meta(ge=1, le=8)] = 3
+    level_m: Annotated[float, msgspec.Meta(ge=0.8, le=4)] = 1.9  # height of one
+    rack_depth_m: Annotated[float, msgspec.Meta(ge=0.4, le=4)] = 1.2
+    aisle_m: Annotated[float, msgspec.Meta(ge=1.5, le=10)] = 3.2  # width
+    cross_aisle_m: Annotated[float, msgspec.Meta(ge=2, le=20)] = 5.0  # at both ends of the racks
+    height_m: Annotated[float, msgspec.Meta(ge=2.5, le=30)] = 8.0  # of the hall
+    load_share: Share = 0.8  # of the places on the shelves that are taken
+
+
+class MineSpec(EmptySpec, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="mine"):
+    """Tunnels in rock; `size_m` is the side of the square in which junctions lie."""
+
+    size_m: Annotated[float, msgspec.Meta(ge=10, le=500)] = 100.0
+    roughness_m: Annotated[float, msgspec.Meta(ge=0, le=5)] = 0.08
+    roughness_length_m: Positive = 3.0
+    spacing_m: Annotated[float, msgspec.Meta(ge=8, le=100)] = 25.0  # of the junctions
+    jitter_m: Annotated[float, msgspec.Meta(ge=0, le=20)] = 4.0
+    bend_m: Annotated[float, msgspec.Meta(ge=0, le=20)] = 3.0
+    loops: Share = 0.4  # of the tunnels that would make a ring, how many are there
+    half_width_m: tuple[Positive, Positive] = (1.8, 2.8)  # low and high
+    tunnel_height_m: tuple[Positive, Positive] = (3.2, 4.5)
+    rock_roughness_m: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.15  # rms of walls and roof
+    rock_length_m: Annotated[float, msgspec.Meta(ge=0.3, le=10)] = 1.0  # size of their bumps
+    rock_cell_m: Annotated[float, msgspec.Meta(ge=0.2, le=1)] = 0.4  # of their triangles
+
+
+WorldSpec = EmptySpec | PoissonSpec | StemsSpec | WarehouseSpec | MineSpec
+KINDS: dict[str, type[EmptySpec]] = {
+    "empty": EmptySpec,
+    "poisson": PoissonSpec,
+    "stems": StemsSpec,
+    "warehouse": WarehouseSpec,
+    "mine": MineSpec,
+}
+_SPANS = (
+    "branch_length_m", "branch_diameter_m", "branch_height_m", "walker_speed_m_s", "half_width_m", "tunnel_height_m",
+)  # fmt: skip
 
 
 def parse_spec(values: Mapping[str, object], *, file: str = "") -> WorldSpec:
@@ -92,7 +140,7 @@ def parse_spec(values: Mapping[str, object], *, file: str = "") -> WorldSpec:
         spec: WorldSpec = msgspec.convert(dict(values), WorldSpec)
     except msgspec.ValidationError as error:
         raise _readable(error, KINDS[kind], file) from None
-    for name in ("branch_length_m", "branch_diameter_m", "branch_height_m", "walker_speed_m_s"):
+    for name in _SPANS:
         low, high = getattr(spec, name, (0.0, 0.0))
         if low > high:
             raise InputError(f"{low} exceeds {high}", file=file, field=name, valid="low, high")

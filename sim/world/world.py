@@ -11,18 +11,30 @@ import yaml
 from companion.core.errors import InputError
 from companion.core.messages import Array
 from sim.world import stand
-from sim.world.mesh import BRANCH, TRUNK, Mesh, assemble, ground_mesh, leaf_mesh, tube_mesh
-from sim.world.model import BRANCH_CONE, TRUNK_CONE, Stems, World
+from sim.world.mesh import BRANCH, TRUNK, Mesh, assemble, ground_mesh, leaf_mesh, tube_mesh, wall_mesh
+from sim.world.mine import junctions, mine_triangles, tunnels
+from sim.world.model import BRANCH_CONE, TRUNK_CONE, Air, Stems, World
 from sim.world.reach import grid_of
-from sim.world.spec import EmptySpec, PoissonSpec, StemsSpec, TreesSpec, WorldSpec, parse_spec
+from sim.world.spec import (
+    EmptySpec,
+    MineSpec,
+    PoissonSpec,
+    StemsSpec,
+    TreesSpec,
+    WarehouseSpec,
+    WorldSpec,
+    parse_spec,
+)
 from sim.world.stems import read_stems
 from sim.world.terrain import heights_at, make_heights
 from sim.world.walkers import make_walkers
+from sim.world.walls import make_walls
+from sim.world.warehouse import hall_size, hall_start, warehouse_triangles
 
 __all__ = ["World", "build_world", "load_world", "read_spec"]
 
 WORLDS_DIR = Path(__file__).resolve().parents[2] / "configs" / "worlds"
-_STREAMS = ("stems", "terrain", "heights", "lean", "branches", "leaves", "walkers")
+_STREAMS = ("stems", "terrain", "heights", "lean", "branches", "leaves", "walkers", "walls")
 
 
 def load_world(value: str, *, seed: int, options: Mapping[str, object] | None = None) -> World:
@@ -78,7 +90,8 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
     """Grow the stand that `spec` describes."""
     streams = {part: np.random.default_rng([seed, k]) for k, part in enumerate(_STREAMS)}
     xy, dbh_m, height_m, low, high = _stand(spec, streams)
-    start = _start(spec, xy, dbh_m, low, high)
+    lines = _tunnels(spec, streams["walls"])
+    start = _start(spec, xy, dbh_m, low, high, lines)
     if isinstance(spec, PoissonSpec):
         keep = np.hypot(*(xy - start).T) - dbh_m / 2 >= spec.clearing_m
         xy, dbh_m, height_m = xy[keep], dbh_m[keep], height_m[keep]
@@ -95,7 +108,8 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
         lambda points: heights_at(heights, origin, spec.cell_m, points),
         streams["walkers"],
     )
-    parts = [ground_mesh(heights, origin, spec.cell_m), *leafy]
+    walls = _walls(spec, start, lines, (heights, origin), streams["walls"])
+    parts = [ground_mesh(heights, origin, spec.cell_m), *leafy, *([wall_mesh(walls)] if len(walls) else [])]
     return _frozen(
         World(
             name=name,
@@ -110,6 +124,8 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
             mesh=assemble(parts),
             grid=grid_of(cones),
             walkers=walkers,
+            walls=make_walls(walls),
+            air=Air(spec.light, spec.dust, spec.lidar_loss),
         )
     )
 
@@ -122,7 +138,7 @@ def _stand(spec: WorldSpec, streams: Mapping[str, np.random.Generator]) -> tuple
         height = np.where(np.isnan(measured.height_m), drawn, np.maximum(measured.height_m, 2.0))
         low, high = measured.xy_m.min(axis=0), measured.xy_m.max(axis=0)
         return measured.xy_m, measured.dbh_m, height, low, high
-    low, high = np.zeros(2), np.full(2, spec.size_m)
+    low, high = np.zeros(2), hall_size(spec) if isinstance(spec, WarehouseSpec) else np.full(2, spec.size_m)
     if not isinstance(spec, PoissonSpec):
         return np.empty((0, 2)), np.empty(0), np.empty(0), low, high
     xy = stand.scatter(spec, streams["stems"])
@@ -130,9 +146,9 @@ def _stand(spec: WorldSpec, streams: Mapping[str, np.random.Generator]) -> tuple
     return xy, dbh, stand.heights_of(spec, dbh, streams["heights"]), low, high
 
 
-def _start(spec: WorldSpec, xy: Array, dbh_m: Array, low: Array, high: Array) -> Array:
+def _start(spec: WorldSpec, xy: Array, dbh_m: Array, low: Array, high: Array, lines: list[Array]) -> Array:
     """Where the flight starts; a measured map must have room there."""
-    start = np.array(spec.start_m) if spec.start_m else stand.open_place(xy, dbh_m, low, high)
+    start = np.array(spec.start_m) if spec.start_m else _own_start(spec, xy, dbh_m, low, high, lines)
     if np.any(start < low) or np.any(start > high):
         valid = f"x {low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f}"
         raise InputError("lies outside the stand", field="start_m", valid=valid)
@@ -141,6 +157,31 @@ def _start(spec: WorldSpec, xy: Array, dbh_m: Array, low: Array, high: Array) ->
         valid = f"at most {room:.2f} at the start {start[0]:.2f}, {start[1]:.2f}"
         raise InputError(f"no room of {spec.clearing_m:g} m without felling a tree", field="clearing_m", valid=valid)
     return start
+
+
+def _own_start(spec: WorldSpec, xy: Array, dbh_m: Array, low: Array, high: Array, lines: list[Array]) -> Array:
+    """The most open place near the middle, the hall's cross aisle, or the junction nearest to the middle."""
+    if isinstance(spec, WarehouseSpec):
+        return hall_start(spec)
+    if isinstance(spec, MineSpec):
+        ends = np.array([line[k] for line in lines for k in (0, -1)])
+        return np.asarray(ends[np.argmin(np.linalg.norm(ends - (low + high) / 2, axis=1))])
+    return stand.open_place(xy, dbh_m, low, high)
+
+
+def _tunnels(spec: WorldSpec, rng: np.random.Generator) -> list[Array]:
+    return tunnels(junctions(spec, rng), spec, rng) if isinstance(spec, MineSpec) else []
+
+
+def _walls(
+    spec: WorldSpec, start: Array, lines: list[Array], ground: tuple[Array, Array], rng: np.random.Generator
+) -> Array:
+    """Triangles (T, 3, 3) of what neither grows nor lies on the ground, world frame."""
+    if isinstance(spec, MineSpec):
+        return mine_triangles(spec, [line - start for line in lines], ground, rng)
+    if isinstance(spec, WarehouseSpec):
+        return np.asarray(warehouse_triangles(spec, rng) - [*start, 0.0])
+    return np.zeros((0, 3, 3))
 
 
 def _ground(spec: EmptySpec, low: Array, high: Array, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -179,7 +220,7 @@ def _clear_of_start(branches: Array, radius_m: float) -> np.ndarray:
 
 
 def _frozen(world: World) -> World:
-    for holder in (world, world.stems, world.mesh, world.grid, world.walkers):
+    for holder in (world, world.stems, world.mesh, world.grid, world.walkers, world.walls):
         for value in vars(holder).values():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False

@@ -181,13 +181,13 @@ def test_errors_of_stem_maps(value, field, valid):
 @pytest.mark.parametrize(
     ("value", "field", "valid"),
     [
-        ("jungle", "world", "demo, empty, longleaf-style, moving, poisson"),
+        ("jungle", "world", "clearing, demo, empty, longleaf-style, mine, moving, poisson, warehouse"),
         ("poisson,trees=3", "trees", "stems_per_ha"),
         ("poisson,stems_per_ha=many", "stems_per_ha", ""),
         ("poisson,stems_per_ha=-1", "stems_per_ha", ""),
         ("poisson,stems_per_ha=4000,min_spacing_m=3", "stems_per_ha", "at most 707"),
         ("poisson,branch_height_m=5/2", "branch_height_m", "low, high"),
-        ("poisson,kind=jungle", "kind", "empty, poisson, stems"),
+        ("poisson,kind=jungle", "kind", "empty, poisson, stems, warehouse, mine"),
         ("poisson,dense", "world", "key=value"),
         ("stems:/nowhere.csv", "stems", "a CSV file"),
     ],
@@ -223,7 +223,9 @@ def test_a_yaml_file_may_name_a_stem_map_beside_it(tmp_path):
 def test_every_world_of_ours_loads_by_name_and_starts_free(file):
     world = load_world(file.stem, seed=3)
     assert world.name == file.stem
-    assert world.range_to_surface(np.array([0.0, 0.0, 30.0]), np.array([0.0, 0.0, -1.0])) == pytest.approx(30.0)
+    above_m = 2.0 if len(world.walls) else 30.0  # halls and mines have roofs
+    down = np.array([0.0, 0.0, -1.0])
+    assert world.range_to_surface(np.array([0.0, 0.0, above_m]), down) == pytest.approx(above_m, abs=0.01)
     assert all(value.flags.writeable is False for value in (world.cones, world.heights, world.mesh.vertices))
 
 
