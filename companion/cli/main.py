@@ -71,6 +71,7 @@ GROUPS = {  # group -> help, command -> module and function
             "bus": "bench:bus",
             "estimators": "bench_estimators:estimators",
             "mapping": "bench_mapping:mapping",
+            "places": "bench_places:places",
             "planners": "bench_planners:planners",
             "planning": "bench_planning:planning",
             "tracking": "bench_tracking:tracking",

@@ -164,6 +164,16 @@ class PoseCorrections:
     q_odom_body: Array  # (K, 4)
 
 
+@message
+class MapFromOdom:
+    """Where loops put `odom` in the corrected map; identity until a closure. It may jump, `odom` never does."""
+
+    stamp_ns: int
+    p_map_odom: Array  # (3,)
+    q_map_odom: Array  # (4,)
+    closures: int  # that hold
+
+
 # --- mapping ------------------------------------------------------------------------
 
 

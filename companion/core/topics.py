@@ -42,6 +42,7 @@ REGISTERED = Topic("estimation/registered_scan", m.RegisteredScan, 10.0, recorde
 ODOMETRY = Topic("estimation/odometry", m.Odometry, 100.0, deadline_s=0.2, service="control")
 SMOOTHED = Topic("estimation/smoothed", m.SmoothedState, 10.0)
 CORRECTIONS = Topic("estimation/corrections", m.PoseCorrections, 0.0, service="latched")
+MAP_FROM_ODOM = Topic("estimation/map_from_odom", m.MapFromOdom, 0.0, service="latched")
 # mapping
 LOCAL_MAP = Topic("mapping/local_map", m.LocalMap, 5.0, recorded=False, deadline_s=1.0, service="bulk")
 MAP_STATUS = Topic("mapping/status", m.MapStatus, 5.0, deadline_s=1.0)

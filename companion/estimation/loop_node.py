@@ -7,13 +7,15 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from companion.core.geometry import rotation_from_quaternion
-from companion.core.messages import LioState, PoseCorrections, RegisteredScan, Why
+from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
+from companion.core.messages import LioState, MapFromOdom, PoseCorrections, RegisteredScan, Why
 from companion.core.node import Node, Outputs, on
-from companion.core.topics import CORRECTIONS, LIO_STATE, REGISTERED, WHY
+from companion.core.topics import CORRECTIONS, LIO_STATE, MAP_FROM_ODOM, REGISTERED, WHY
 from companion.estimation.downsample import Thinner
+from companion.estimation.places.constellation import constellation, match
 from companion.estimation.places.loops import LoopConfig, LoopFinder
 from companion.estimation.places.verify import align
+from companion.estimation.places.views import panorama, sights
 
 
 class LoopNodeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -25,9 +27,9 @@ class LoopNodeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class LoopNode(Node):
-    """Publishes only what moves the past; odometry, and what flies on it, is never touched."""
+    """Publishes only what moves the past and the map; odometry, and what flies on it, is never touched."""
 
-    publishes = (CORRECTIONS, WHY)
+    publishes = (CORRECTIONS, MAP_FROM_ODOM, WHY)
 
     def __init__(self, config: LoopNodeConfig) -> None:
         self.config = config
@@ -36,10 +38,11 @@ class LoopNode(Node):
             self._compile()
 
     @on(LIO_STATE)
-    def begin(self, state: LioState) -> None:
+    def begin(self, state: LioState) -> Outputs:
         """A start of odometry is a new frame: what was seen before hangs on nothing."""
         if state.source == "start":
             self.finder = LoopFinder(self.config.loops)
+            yield MAP_FROM_ODOM(self._map_from_odom(state.stamp_ns))
 
     @on(REGISTERED)
     def scan(self, scan: RegisteredScan) -> Outputs:
@@ -47,23 +50,21 @@ class LoopNode(Node):
         if not self.config.enabled or not _usable(scan, self.finder):
             return
         R = rotation_from_quaternion(scan.q_odom_body)
-        found = self.finder.add(scan.stamp_ns, scan.points_body, R, scan.p_odom)
-        if not found:
+        if not self.finder.add(scan.stamp_ns, scan.points_body, R, scan.p_odom) or not self._moves():
             return
+        if refused := self.finder.audit():
+            yield WHY(
+                _why(scan.stamp_ns, f"{refused} closures are let go of", "the chain and the others contradict them")
+            )
         before = self.finder.poses()
         poses = self.finder.corrected()
         shift_m = float(np.linalg.norm(poses[:, :3] - before[:, :3], axis=1).max())
-        if shift_m < self.config.least_shift_m:
+        if shift_m < self.config.least_shift_m or not self.finder.closures:
             return
         closure = self.finder.closures[-1]
-        yield WHY(
-            Why(
-                stamp_ns=scan.stamp_ns,
-                node="LoopNode",
-                what=f"place of keyframe {closure.earlier} seen again: the past moves by up to {shift_m:.2f} m",
-                because=f"{closure.trunks} trunks agree and {closure.near:.0%} of the points fit",
-            )
-        )
+        what = f"place of keyframe {closure.earlier} seen again: the past moves by up to {shift_m:.2f} m"
+        known_by = f"{closure.trunks} trunks agree" if closure.trunks else "what is around looks alike"
+        yield WHY(_why(scan.stamp_ns, what, f"{known_by} and {closure.near:.0%} of the points fit"))
         yield CORRECTIONS(
             PoseCorrections(
                 stamp_ns=scan.stamp_ns,
@@ -72,13 +73,36 @@ class LoopNode(Node):
                 q_odom_body=poses[:, 3:].copy(),
             )
         )
+        yield MAP_FROM_ODOM(self._map_from_odom(scan.stamp_ns))
+
+    def _moves(self) -> bool:
+        """Whether a new closure says more than the chain knows already."""
+        return self.finder.disagreement_m() >= self.config.loops.settled_m
+
+    def _map_from_odom(self, stamp_ns: int) -> MapFromOdom:
+        finder = self.finder
+        return MapFromOdom(
+            stamp_ns=stamp_ns,
+            p_map_odom=finder.p_map_odom.copy(),
+            q_map_odom=quaternion_from_rotation(finder.R_map_odom),
+            closures=len(finder.closures),
+        )
 
     def _compile(self) -> None:
-        """Compare a corner of a room with itself, so that no closure in flight waits for compilers."""
+        """Compare a corner of a room and four trunks with themselves: no closure in flight waits for compilers."""
         grid = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), axis=-1).reshape(-1, 2) / 4.0
         walls = [np.insert(grid, axis, 0.0, axis=1) for axis in range(3)]
         corner = Thinner().firsts(np.concatenate(walls).astype(np.float32), self.config.loops.thin_m)
-        align(corner, corner, (np.eye(3), np.zeros(3)), self.config.loops.verify)
+        compare = self.config.loops.compare
+        align(corner, corner, (np.eye(3), np.zeros(3)), compare.verify)
+        trunks = constellation(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [5.0, 6.0]]), compare.constellation)
+        match(trunks, trunks, compare.constellation)
+        seen = panorama(corner, compare.view)
+        sights(seen[None], np.zeros((1, 3)), seen, compare.view)
+
+
+def _why(stamp_ns: int, what: str, because: str) -> Why:
+    return Why(stamp_ns=stamp_ns, node="LoopNode", what=what, because=because)
 
 
 def _usable(scan: RegisteredScan, finder: LoopFinder) -> bool:

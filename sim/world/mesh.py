@@ -76,6 +76,13 @@ def leaf_mesh(centers: Array, size_m: float, rng: np.random.Generator) -> Mesh:
     return _mesh(corners.reshape(-1, 3), np.arange(3 * len(centers)).reshape(-1, 3), LEAF, 0.3 * size_m)
 
 
+def some_triangles(mesh: Mesh, keep: NDArray[np.bool_]) -> Mesh:
+    """Those triangles (T,) of a mesh whose vertices are not shared; the others leave no trace."""
+    vertices = mesh.vertices[mesh.triangles[keep]].reshape(-1, 3)
+    triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
+    return Mesh(vertices, triangles, mesh.classes[keep], mesh.widths_m[keep])
+
+
 def wall_mesh(corners: Array) -> Mesh:
     """Triangles (T, 3, 3) of racks, halls and rock."""
     return _mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), WALL, np.inf)

@@ -56,6 +56,7 @@ class TreesSpec(EmptySpec, frozen=True, forbid_unknown_fields=True, kw_only=True
     height_rate_per_m: Positive = 3.0  # h = 1.3 + (height_max - 1.3) (1 - exp(-rate dbh)), Meyer 1940
     height_sd: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.08  # relative spread around the curve
     lean_deg: Annotated[float, msgspec.Meta(ge=0, le=30)] = 1.5  # sigma per axis
+    felled: Share = 0.0  # of the trees, gone since: those that are left stand as they do without it
     crown: bool = True  # leaves, or a bare stand
     crown_base_m: Positive = 8.0  # no leaf below, above ground
     crown_radius_m: Positive = 1.8

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.core.errors import InputError
 from companion.core.messages import Array
@@ -107,7 +108,7 @@ def branch_cones(spec: TreesSpec, trunks: Array, rng: np.random.Generator) -> Ar
     """Thin straight cones (K, 9) from the trunks' axes; trees that end below their heights get none."""
     low, high = spec.branch_height_m
     top = np.minimum(high, 0.85 * (trunks[:, 6] - ROOT_M))
-    bearing = np.repeat(np.flatnonzero(top > low), spec.branches)
+    bearing = tree_of_branch(spec, trunks)
     count = len(bearing)
     draw = rng.random((count, 5))
     trunk = trunks[bearing]
@@ -124,11 +125,26 @@ def branch_cones(spec: TreesSpec, trunks: Array, rng: np.random.Generator) -> Ar
     return cones
 
 
+def tree_of_branch(spec: TreesSpec, trunks: Array) -> NDArray[np.int64]:
+    """Rows (K,) of the trunks that the branches grow from, in their order."""
+    low, high = spec.branch_height_m
+    return np.repeat(np.flatnonzero(np.minimum(high, 0.85 * (trunks[:, 6] - ROOT_M)) > low), spec.branches)
+
+
+def tree_of_leaf(spec: TreesSpec, trunks: Array) -> NDArray[np.int64]:
+    """Rows (L,) of the trunks that the leaves grow on, in their order."""
+    return np.repeat(np.flatnonzero(trunks[:, 6] - ROOT_M > spec.crown_base_m + 1.0), spec.leaves)
+
+
+def standing(spec: TreesSpec, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which trees (count,) are not felled."""
+    return np.asarray(rng.random(count) >= spec.felled)
+
+
 def leaf_centers(spec: TreesSpec, trunks: Array, rng: np.random.Generator) -> Array:
     """Centres (L, 3) in ellipsoids between the crown's base and the top."""
     height = trunks[:, 6] - ROOT_M
-    leafy = np.flatnonzero(height > spec.crown_base_m + 1.0)
-    tree = np.repeat(leafy, spec.leaves)
+    tree = tree_of_leaf(spec, trunks)
     ball = rng.standard_normal((len(tree), 3))
     ball *= (rng.random(len(tree)) ** (1 / 3) / np.linalg.norm(ball, axis=1))[:, None]
     depth = (height - spec.crown_base_m)[tree] - 2 * spec.leaf_m

@@ -11,7 +11,7 @@ import yaml
 from companion.core.errors import InputError
 from companion.core.messages import Array
 from sim.world import stand
-from sim.world.mesh import BRANCH, TRUNK, Mesh, assemble, ground_mesh, leaf_mesh, tube_mesh, wall_mesh
+from sim.world.mesh import BRANCH, TRUNK, Mesh, assemble, ground_mesh, leaf_mesh, some_triangles, tube_mesh, wall_mesh
 from sim.world.mine import junctions, mine_triangles, tunnels
 from sim.world.model import BRANCH_CONE, TRUNK_CONE, Air, Stems, World
 from sim.world.reach import grid_of
@@ -34,7 +34,7 @@ from sim.world.warehouse import hall_size, hall_start, warehouse_triangles
 __all__ = ["World", "build_world", "load_world", "read_spec"]
 
 WORLDS_DIR = Path(__file__).resolve().parents[2] / "configs" / "worlds"
-_STREAMS = ("stems", "terrain", "heights", "lean", "branches", "leaves", "walkers", "walls")
+_STREAMS = ("stems", "terrain", "heights", "lean", "branches", "leaves", "walkers", "walls", "felled")
 
 
 def load_world(value: str, *, seed: int, options: Mapping[str, object] | None = None) -> World:
@@ -100,7 +100,7 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
     heights.flags.writeable = origin.flags.writeable = False  # one type for the kernels
     z = heights_at(heights, origin, spec.cell_m, xy)
     stems = Stems(xy[:, 0].copy(), xy[:, 1].copy(), z, dbh_m, height_m)
-    cones, kinds, leafy = _trees(spec, stems, streams)
+    cones, kinds, leafy, stems = _trees(spec, stems, streams)
     walkers = make_walkers(
         spec,
         np.column_stack([xy, dbh_m / 2]),
@@ -196,19 +196,26 @@ def _ground(spec: EmptySpec, low: Array, high: Array, rng: np.random.Generator) 
 
 def _trees(
     spec: WorldSpec, stems: Stems, streams: Mapping[str, np.random.Generator]
-) -> tuple[Array, np.ndarray, list[Mesh]]:
-    """Cones with their kinds, and the triangles of trunks, branches and leaves."""
+) -> tuple[Array, np.ndarray, list[Mesh], Stems]:
+    """Cones with their kinds, the triangles of trunks, branches and leaves, and the stems that are not felled."""
     if not isinstance(spec, TreesSpec):
-        return np.empty((0, 9)), np.empty(0, np.int8), []
+        return np.empty((0, 9)), np.empty(0, np.int8), [], stems
     trunks = stand.trunk_cones(stems, spec.lean_deg, streams["lean"])
+    stands = stand.standing(spec, len(stems), streams["felled"])
     branches = stand.branch_cones(spec, trunks, streams["branches"])
-    branches = branches[_clear_of_start(branches, spec.clearing_m)]
-    meshes = [tube_mesh(trunks, TRUNK), tube_mesh(branches, BRANCH)]
+    branches = branches[stands[stand.tree_of_branch(spec, trunks)] & _clear_of_start(branches, spec.clearing_m)]
+    meshes = [tube_mesh(trunks[stands], TRUNK), tube_mesh(branches, BRANCH)]
     if spec.crown:
         centers = stand.leaf_centers(spec, trunks, streams["leaves"])
-        meshes.append(leaf_mesh(centers, spec.leaf_m, streams["leaves"]))
-    kinds = np.repeat(np.array([TRUNK_CONE, BRANCH_CONE], np.int8), [len(trunks), len(branches)])
-    return np.concatenate([trunks, branches]), kinds, meshes
+        leaves = leaf_mesh(centers, spec.leaf_m, streams["leaves"])
+        meshes.append(some_triangles(leaves, stands[stand.tree_of_leaf(spec, trunks)]))
+    kinds = np.repeat(np.array([TRUNK_CONE, BRANCH_CONE], np.int8), [int(stands.sum()), len(branches)])
+    return np.concatenate([trunks[stands], branches]), kinds, meshes, _some_stems(stems, stands)
+
+
+def _some_stems(stems: Stems, keep: np.ndarray) -> Stems:
+    parts = (stems.x, stems.y, stems.z_ground, stems.dbh_m, stems.height_m)
+    return Stems(*(part[keep] for part in parts))
 
 
 def _clear_of_start(branches: Array, radius_m: float) -> np.ndarray:

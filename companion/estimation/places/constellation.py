@@ -16,6 +16,7 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -24,6 +25,7 @@ from companion.core.messages import Array
 Metres = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 _REFINEMENTS = 3
+_RIVAL = 0.5  # share of the most trunks from which on a place may still win by refinement
 
 
 class ConstellationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -102,7 +104,9 @@ def match(known: Constellation, view: Constellation, config: ConstellationConfig
     for n in np.argsort(-counts, kind="stable")[: 10 * config.most_places]:
         if any(np.linalg.norm(p.p_map - shift[n]) < config.elsewhere_m for p in places):
             continue
-        places.append(_refined(known, view, Place(shift[n], float(yaw[n]), int(counts[n]), 0.0, 0.0), config))
+        place = Place(shift[n], float(yaw[n]), int(counts[n]), counts[n] / len(view.centers), math.inf)
+        rival = counts[n] >= _RIVAL * counts.max()  # the others only need to be there
+        places.append(_refined(known, view, place, config) if rival else place)
         if len(places) == config.most_places:
             break
     return sorted(places, key=lambda p: (-p.inliers, p.rms_m))
@@ -116,6 +120,14 @@ def accepted(places: list[Place], config: ConstellationConfig) -> Place | None:
     sure = best.inliers >= config.least_inliers and best.share >= config.least_share
     others = [p.inliers for p in places[1:] if np.linalg.norm(p.p_map - best.p_map) >= config.elsewhere_m]
     return best if sure and max(others, default=0) <= config.least_lead * best.inliers else None
+
+
+def ambiguous(places: list[Place], config: ConstellationConfig) -> bool:
+    """Whether trunks enough agree, but elsewhere, too: rows of posts, a plantation."""
+    if not places:
+        return False
+    best = places[0]
+    return best.inliers >= config.least_inliers and best.share >= config.least_share and not accepted(places, config)
 
 
 def _corners(points: Array, tree: cKDTree, neighbours: int) -> NDArray[np.int64]:
@@ -162,14 +174,57 @@ def _inliers(
     known: Constellation, view: Constellation, motions: tuple[Array, Array], config: ConstellationConfig
 ) -> NDArray[np.int64]:
     """Trunks of the map (H,) that meet one of the view."""
-    assert known.trunk_tree is not None
     yaw, shift = motions
-    placed = _turned(np.broadcast_to(view.centers, (len(yaw), *view.centers.shape)), yaw) + shift[:, None]
-    _, met = known.trunk_tree.query(placed, distance_upper_bound=config.inlier_m)
-    met = np.sort(met, axis=1)  # two trunks that meet the same one count once
-    fresh = np.diff(met, axis=1, prepend=-1) != 0
-    counts: NDArray[np.int64] = np.sum(fresh & (met < len(known.centers)), axis=1)
+    counts = np.zeros(len(yaw), np.int64)
+    cells, corner = _cells(known.centers, config.inlier_m)
+    tables = (cells, corner, np.ascontiguousarray(known.centers), np.ascontiguousarray(view.centers))
+    _count_inliers(tables, yaw, shift, config.inlier_m, counts)
     return counts
+
+
+def _cells(centers: Array, cell_m: float) -> tuple[NDArray[np.int64], Array]:
+    """Trunks by cell: (nx, ny, 3), up to three of each, -1: none; and the low corner (2,) of a rim of one cell."""
+    corner = centers.min(axis=0) - cell_m
+    at = np.floor((centers - corner) / cell_m).astype(np.int64)
+    cells = np.full((*(at.max(axis=0) + 2), 3), -1, np.int64)
+    for n, (i, j) in enumerate(at.tolist()):
+        free = np.flatnonzero(cells[i, j] < 0)
+        if len(free):
+            cells[i, j, free[0]] = n
+    return cells, corner
+
+
+@njit(cache=True, nogil=True)
+def _count_inliers(tables, yaw, shift, inlier_m, counts):  # type: ignore[no-untyped-def]
+    """Trunks of the map that are the nearest of some trunk of the view, each counted once."""
+    cells, corner, known, view = tables
+    last = np.full(known.shape[0], -1, np.int64)
+    for h in range(yaw.shape[0]):
+        c, s = math.cos(yaw[h]), math.sin(yaw[h])
+        for n in range(view.shape[0]):
+            x = c * view[n, 0] - s * view[n, 1] + shift[h, 0]
+            y = s * view[n, 0] + c * view[n, 1] + shift[h, 1]
+            met = _nearest(cells, corner, known, x, y, inlier_m)
+            if met >= 0 and last[met] != h:
+                last[met] = h
+                counts[h] += 1
+
+
+@njit(cache=True, nogil=True)
+def _nearest(cells, corner, known, x, y, inlier_m):  # type: ignore[no-untyped-def]
+    """The nearest trunk within `inlier_m`, -1: none."""
+    i, j = math.floor((x - corner[0]) / inlier_m), math.floor((y - corner[1]) / inlier_m)
+    best, met = inlier_m * inlier_m, -1
+    for a in range(max(i - 1, 0), min(i + 2, cells.shape[0])):
+        for b in range(max(j - 1, 0), min(j + 2, cells.shape[1])):
+            for k in range(3):
+                n = cells[a, b, k]
+                if n < 0:
+                    break
+                gap = (known[n, 0] - x) ** 2 + (known[n, 1] - y) ** 2
+                if gap < best:
+                    best, met = gap, n
+    return met
 
 
 def _refined(known: Constellation, view: Constellation, place: Place, config: ConstellationConfig) -> Place:

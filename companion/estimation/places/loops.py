@@ -19,16 +19,7 @@ import numpy as np
 from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
 from companion.core.messages import Array, Array32
 from companion.estimation.downsample import Thinner
-from companion.estimation.places.constellation import (
-    Constellation,
-    ConstellationConfig,
-    Place,
-    accepted,
-    constellation,
-    match,
-)
-from companion.estimation.places.trunks import TrunkConfig, detect_trunks
-from companion.estimation.places.verify import VerifyConfig, align
+from companion.estimation.places.submap import CompareConfig, Submap, compare
 from companion.estimation.pose_graph.graph import PoseGraph
 from companion.estimation.pose_graph.optimise import OptimiseConfig, optimise
 
@@ -39,20 +30,24 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 class LoopConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Keyframes, submaps, and which pairs are compared."""
 
-    trunks: TrunkConfig = TrunkConfig()
-    constellation: ConstellationConfig = ConstellationConfig()
-    verify: VerifyConfig = VerifyConfig()
+    compare: CompareConfig = CompareConfig()
     optimise: OptimiseConfig = OptimiseConfig(kernel="dcs")
+    audit: OptimiseConfig = OptimiseConfig(
+        kernel="gnc"
+    )  # closures that it refuses are let go of before anything is said
     keyframe_m: Positive = 2.0  # way between keyframes
     submap_m: Positive = 6.0  # way between submaps
     window_m: Positive = 16.0  # way whose scans make a submap
     radius_m: Positive = 18.0  # of a submap
-    scan_every: Count = 3
-    thin_m: Positive = 0.08  # of scans and submaps
+    scan_m: Positive = 1.0  # way between the scans that are kept
+    thin_m: Positive = 0.12  # of scans and submaps
     least_way_m: Positive = 30.0  # flown between two submaps that may close a loop
     gate_m: Positive = 6.0  # distance by odometry of two submaps that are compared at most ...
     gate_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03  # ... plus this share of the way between
     most_closures: Count = 2  # per submap, nearest first
+    rest_m: Annotated[float, msgspec.Meta(ge=0)] = 25.0
+    """After a closure that moves nothing odometry is right: so far is flown before places are compared again."""
+    settled_m: Positive = 0.1  # a closure that disagrees less with the chain moves nothing
     odometry_sigma_m: Positive = 0.01  # per keyframe ...
     odometry_share: Positive = 0.01  # ... plus this share of the step
     odometry_sigma_rad: Positive = 2e-3
@@ -68,15 +63,8 @@ class Closure:
     later: int
     R: Array  # (3, 3), of body axes
     p: Array  # (3,), m, in the earlier body
-    trunks: int  # that agreed
+    trunks: int  # that agreed; 0: known by its panorama
     near: float  # share of points that fit
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Submap:
-    keyframe: int
-    sky: Constellation  # about the keyframe, in axes of odom
-    cloud: Array32  # likewise
 
 
 class LoopFinder:
@@ -91,15 +79,19 @@ class LoopFinder:
         self.config = config
         self.stamps_ns: list[int] = []
         self.closures: list[Closure] = []
+        self._newest: list[Closure] = []
+        self.refused = 0  # closures that the audit let go of
+        self.R_map_odom: Array = np.eye(3)  # as corrected last
+        self.p_map_odom: Array = np.zeros(3)
         self._R: list[Array] = []  # of keyframes, as odometry had them
         self._p: list[Array] = []
         self._poses: list[Array] = []  # (7,) as corrected last, continued by odometry
         self._way: list[float] = []
-        self._submaps: list[_Submap] = []
+        self._submaps: list[Submap] = []
         self._recent: deque[tuple[float, Array32]] = deque()  # (way, points in odom)
         self._last: Array | None = None
         self._flown_m = 0.0
-        self._scans = 0
+        self._rested_m = -math.inf  # way at which a closure moved nothing
         self._thinner = Thinner()
 
     def add(self, stamp_ns: int, points_body: Array32, R_odom_body: Array, p_odom: Array) -> int:
@@ -108,14 +100,23 @@ class LoopFinder:
         if self._last is not None:
             self._flown_m += float(np.linalg.norm(p_odom - self._last))
         self._last = p_odom
-        if self._scans % config.scan_every == 0:
+        if not self._recent or self._flown_m - self._recent[-1][0] >= config.scan_m:
             self._remember(points_body, R_odom_body, p_odom)
-        self._scans += 1
         if self._way and self._flown_m - self._way[-1] < config.keyframe_m:
             return 0
         self._keyframe(stamp_ns, R_odom_body, p_odom)
         since = self._flown_m - (self._way[self._submaps[-1].keyframe] if self._submaps else 0.0)
         return self._close() if since >= config.submap_m else 0
+
+    @property
+    def way_m(self) -> list[float]:
+        """Flown by odometry up to each keyframe."""
+        return list(self._way)
+
+    @property
+    def submap_keyframes(self) -> list[int]:
+        """The keyframe of each submap."""
+        return [submap.keyframe for submap in self._submaps]
 
     def poses(self) -> Array:
         """Poses (K, 7) of the keyframes as corrected last, continued by odometry."""
@@ -123,17 +124,39 @@ class LoopFinder:
 
     def corrected(self) -> Array:
         """The most likely poses (K, 7) of the keyframes, x y z qw qx qy qz in odom, under which the newest stays."""
-        done = optimise(self._graph(), self.config.optimise).graph.poses
-        R_new, p_new = rotation_from_quaternion(done[-1, 3:]), done[-1, :3]
+        in_map = self._optimised()
+        R_new, p_new = rotation_from_quaternion(in_map[-1, 3:]), in_map[-1, :3]
         turn = self._R[-1] @ R_new.T
-        rotations = [turn @ rotation_from_quaternion(q) for q in done[:, 3:]]
-        places = (done[:, :3] - p_new) @ turn.T + self._p[-1]
+        self.R_map_odom, self.p_map_odom = turn.T, p_new - turn.T @ self._p[-1]
+        rotations = [turn @ rotation_from_quaternion(q) for q in in_map[:, 3:]]
+        places = (in_map[:, :3] - p_new) @ turn.T + self._p[-1]
         poses = np.array([_pose(R, p) for R, p in zip(rotations, places, strict=True)])
         self._poses = list(poses)
         return poses
 
+    def audit(self) -> int:
+        """Let go of closures that contradict the chain and most others (GNC); returns how many those are."""
+        if not self.closures:
+            return 0
+        first = len(self._p) - 1  # edges of the chain come before closures
+        wrong = {int(k) - first for k in optimise(self._graph(), self.config.audit).refused if k >= first}
+        self.closures = [c for k, c in enumerate(self.closures) if k not in wrong]
+        self.refused += len(wrong)
+        return len(wrong)
+
+    def _optimised(self) -> Array:
+        """Poses (K, 7) in `map`, the frame in which the first keyframe stays where odometry had it."""
+        graph = self._graph()
+        first = graph.poses.copy()
+        if len(first):
+            R = self._R[0] @ rotation_from_quaternion(first[0, 3:]).T
+            turned = [R @ rotation_from_quaternion(q) for q in first[:, 3:]]
+            moved = (first[:, :3] - first[0, :3]) @ R.T + self._p[0]
+            graph = graph.with_poses(np.array([_pose(A, p) for A, p in zip(turned, moved, strict=True)]))
+        return optimise(graph, self.config.optimise).graph.poses
+
     def _remember(self, points_body: Array32, R: Array, p: Array) -> None:
-        near = points_body[np.sum(points_body * points_body, axis=1) < self.config.radius_m**2]
+        near = points_body[_square(points_body) < self.config.radius_m**2]
         points = self._thinner.firsts(np.ascontiguousarray(near), self.config.thin_m)
         self._recent.append((self._flown_m, (points @ R.T + p).astype(np.float32)))
         while self._flown_m - self._recent[0][0] > self.config.window_m:
@@ -155,29 +178,40 @@ class LoopFinder:
     def _close(self) -> int:
         """Make a submap of what was seen last and look for it among the earlier ones."""
         new = self._submap()
-        found = 0
-        for old in self._candidates(new):
+        found: list[Closure] = []
+        resting = self._flown_m - self._rested_m < self.config.rest_m
+        for old in [] if resting else self._candidates(new):
             closure = self._compare(old, new)
             if closure is not None:
-                self.closures.append(closure)
-                found += 1
-            if found == self.config.most_closures:
+                found.append(closure)
+            if len(found) == self.config.most_closures:
                 break
         self._submaps.append(new)
-        return found
+        self.closures.extend(found)
+        self._newest = found
+        if found and self.disagreement_m() < self.config.settled_m:
+            self._rested_m = self._flown_m
+        return len(found)
 
-    def _submap(self) -> _Submap:
+    def disagreement_m(self) -> float:
+        """How far the newest closures are from what the chain of poses says, m."""
+        return max((self._apart_m(closure) for closure in self._newest), default=0.0)
+
+    def _apart_m(self, closure: Closure) -> float:
+        a, b = self._poses[closure.earlier], self._poses[closure.later]
+        chain = rotation_from_quaternion(a[3:]).T @ (b[:3] - a[:3])
+        return float(np.linalg.norm(closure.p - chain))
+
+    def _submap(self) -> Submap:
         config, number = self.config, len(self._p) - 1
         about = np.concatenate([points for _, points in self._recent]) - self._p[-1].astype(np.float32)
-        about = about[np.sum(about * about, axis=1) < config.radius_m**2]
-        cloud = self._thinner.firsts(np.ascontiguousarray(about), config.thin_m)
-        sky = constellation(detect_trunks(cloud.astype(np.float64), config.trunks).centers, config.constellation)
-        return _Submap(number, sky, cloud)
+        about = about[_square(about) < config.radius_m**2]
+        return Submap(number, self._thinner.firsts(np.ascontiguousarray(about), config.thin_m), config.compare)
 
-    def _candidates(self, new: _Submap) -> list[_Submap]:
+    def _candidates(self, new: Submap) -> list[Submap]:
         """Earlier submaps that odometry allows to be the same place, nearest first."""
         here, way = self._poses[new.keyframe][:3], self._way[new.keyframe]
-        near: list[tuple[float, _Submap]] = []
+        near: list[tuple[float, Submap]] = []
         for old in self._submaps:
             between = way - self._way[old.keyframe]
             distance = float(np.linalg.norm(self._poses[old.keyframe][:3] - here))
@@ -188,20 +222,15 @@ class LoopFinder:
     def _gate_m(self, between_m: float) -> float:
         return self.config.gate_m + self.config.gate_share * between_m
 
-    def _compare(self, old: _Submap, new: _Submap) -> Closure | None:
-        place = accepted(match(old.sky, new.sky, self.config.constellation), self.config.constellation)
-        if place is None:
-            return None
+    def _compare(self, old: Submap, new: Submap) -> Closure | None:
         a, b = self._poses[old.keyframe], self._poses[new.keyframe]
         between = self._way[new.keyframe] - self._way[old.keyframe]
-        if np.linalg.norm(place.p_map - (b[:2] - a[:2])) > self._gate_m(between):
-            return None
-        aligned = align(old.cloud, new.cloud, (_about_z(place.yaw), _above(place, b[2] - a[2])), self.config.verify)
-        if aligned is None:
+        met = compare(old, new, b[:3] - a[:3], self._gate_m(between))
+        if met is None:
             return None
         R_old, R_new = self._R[old.keyframe], self._R[new.keyframe]
-        R, p = R_old.T @ aligned.R @ R_new, R_old.T @ aligned.p
-        return Closure(old.keyframe, new.keyframe, R, p, place.inliers, aligned.near)
+        R, p = R_old.T @ met.R @ R_new, R_old.T @ met.p
+        return Closure(old.keyframe, new.keyframe, R, p, met.trunks, met.near)
 
     def _graph(self) -> PoseGraph:
         """The chain of odometry, and the closures."""
@@ -220,18 +249,14 @@ class LoopFinder:
         return PoseGraph(np.arange(count), np.array(self._poses), np.array(ends), measured, information)
 
 
+def _square(points: Array32) -> Array32:
+    """Squared norms (N,); several times quicker than a sum along rows."""
+    return np.asarray(np.einsum("ij,ij->i", points, points))
+
+
 def _pose(R: Array, p: Array) -> Array:
     return np.concatenate([p, quaternion_from_rotation(R)])
 
 
 def _relative(R_a: Array, p_a: Array, R_b: Array, p_b: Array) -> Array:
     return _pose(R_a.T @ R_b, R_a.T @ (p_b - p_a))
-
-
-def _about_z(yaw: float) -> Array:
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _above(place: Place, height_m: float) -> Array:
-    return np.array([place.p_map[0], place.p_map[1], height_m])

@@ -57,7 +57,7 @@ class Trunks:
 def detect_trunks(points: Array, config: TrunkConfig) -> Trunks:
     """Trunks in `points` (N, 3), m, of a frame whose z is up; what is not finite is left out."""
     cloud = np.asarray(points, np.float64)
-    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    cloud = cloud[np.isfinite(cloud @ np.ones(3))]
     if not len(cloud):
         return _trunks([])
     height = cloud[:, 2] - _ground_below(cloud, config.ground_cell_m)

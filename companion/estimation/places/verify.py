@@ -62,6 +62,7 @@ def align(known: Array32, seen: Array32, guess: tuple[Array, Array], config: Ver
             break
     if np.linalg.norm(step[3:]) >= config.settled_m:
         return None
-    gaps, _ = cKDTree(known).query(points @ R.T + p, distance_upper_bound=config.near_m)
+    tree = cKDTree(known, compact_nodes=False, balanced_tree=False)  # asked once: quick to build counts
+    gaps, _ = tree.query(points @ R.T + p, distance_upper_bound=config.near_m)
     near = float(np.isfinite(gaps).mean())
     return Alignment(R, p, near, normal.weakest) if near >= config.least_near else None

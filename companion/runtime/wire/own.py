@@ -26,6 +26,7 @@ FRAMES: dict[type[Any], str] = {  # header.frame_id, where there is one
     **dict.fromkeys((m.Trajectory, m.PlanStatus, m.Setpoint, m.VehicleStatus), "odom"),
     m.Landmarks: "odom",
     m.PoseCorrections: "odom",
+    m.MapFromOdom: "map",
     m.RegisteredScan: "base_link",
     m.SmoothedState: "map",
     m.GroundTruth: "world",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
-from companion.core.messages import LioState, PoseCorrections, RegisteredScan, Why
+from companion.core.messages import LioState, MapFromOdom, PoseCorrections, RegisteredScan, Why
 from companion.core.topics import CORRECTIONS, LIO_STATE, REGISTERED
 from companion.estimation.loop_node import LoopNode, LoopNodeConfig
 from tests.unit.estimation.test_loops import circle, drifting, forest, scans
@@ -72,6 +72,22 @@ def test_corrections_bring_the_past_near_truth_and_leave_the_present(lap):
     assert "trunks agree" in why.because
 
 
+def test_map_from_odom_puts_the_present_where_the_first_pose_says(lap):
+    """In `map` the first keyframe stays: the newest one then lies where truth has it, seen from there."""
+    messages, p_true = lap
+    said = run(LoopNode(LoopNodeConfig()), messages)
+    last = [m for m in said if isinstance(m, MapFromOdom)][-1]
+    corrections = [m for m in said if isinstance(m, PoseCorrections)][-1]
+    assert last.stamp_ns == corrections.stamp_ns
+    assert last.closures >= 1
+    R = rotation_from_quaternion(last.q_map_odom)
+    assert R @ corrections.p_odom[0] + last.p_map_odom == pytest.approx(messages[0].p_odom, abs=1e-3)
+    present = next(m for m in messages if m.stamp_ns == last.stamp_ns)
+    number = last.stamp_ns // 10**8 - 1
+    drifted = np.linalg.norm(present.p_odom - p_true[number])
+    assert np.linalg.norm(R @ present.p_odom + last.p_map_odom - p_true[number]) < 0.3 * drifted
+
+
 def test_rotations_of_corrections_are_unit_quaternions(lap):
     last = [m for m in run(LoopNode(LoopNodeConfig()), lap[0]) if isinstance(m, PoseCorrections)][-1]
     for q in last.q_odom_body:
@@ -93,7 +109,8 @@ def test_a_new_start_forgets_the_old_frame(lap):
     node = LoopNode(LoopNodeConfig())
     half = len(lap[0]) // 2
     run(node, lap[0][:half])
-    assert list(node.handle(LIO_STATE, started(lap[0][half].stamp_ns))) == []
+    (said,) = [out.message for out in node.handle(LIO_STATE, started(lap[0][half].stamp_ns))]
+    assert (said.closures, said.p_map_odom.tolist(), said.q_map_odom.tolist()) == (0, [0, 0, 0], [1, 0, 0, 0])
     assert run(node, lap[0][half:]) == []
     assert node.finder.closures == []
 

@@ -237,3 +237,14 @@ def test_a_slope_keeps_the_bounds_around_the_start():
     assert world.stems.y.max() <= y_max
     rise = world.ground_z(10.0, 0.0) - world.ground_z(-10.0, 0.0)
     assert rise == pytest.approx(20 * np.tan(np.radians(20)), abs=0.8)
+
+
+def test_felling_takes_trees_and_moves_none():
+    whole = load_world("poisson", seed=4, options={"branches": 3})
+    thinned = load_world("poisson", seed=4, options={"branches": 3, "felled": 0.1})
+    left = {tuple(p) for p in positions(thinned)}
+    assert left < {tuple(p) for p in positions(whole)}
+    assert 0.85 < len(left) / len(whole.stems) < 0.95
+    share = {kind: np.sum(thinned.mesh.classes == kind) / np.sum(whole.mesh.classes == kind) for kind in range(4)}
+    assert share[GROUND] == 1.0
+    assert all(share[kind] == pytest.approx(len(left) / len(whole.stems), abs=0.03) for kind in (BRANCH, LEAF))

@@ -1,0 +1,136 @@
+"""Where in a saved map is what is seen: any map of occupied places, with trunks or without.
+
+Windows of about a second are looked up one by one. Where trunks stand their constellation
+proposes a place, elsewhere the panorama does; registration in space confirms it or refuses. A
+window alone may be unsure: the search answers when one is sure, and says nothing otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.errors import InputError
+from companion.core.messages import Array, Array32
+from companion.estimation.downsample import Thinner
+from companion.estimation.places.constellation import Place, accepted, constellation, match
+from companion.estimation.places.correlate import HitMap
+from companion.estimation.places.submap import CompareConfig, best_fit, turn_z
+from companion.estimation.places.trunks import TrunkConfig, detect_trunks
+from companion.estimation.places.verify import Alignment, VerifyConfig, align
+from companion.estimation.places.views import ViewConfig, panorama, panoramas, sights
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class LocateConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How views are compared with a map of voxels, whose points are not exact."""
+
+    compare: CompareConfig = CompareConfig(
+        verify=VerifyConfig(near_m=0.25, least_near=0.6, settled_m=5e-3, iterations=20),
+        view=ViewConfig(most_places=24, elsewhere_m=1.2),
+        view_verify=VerifyConfig(near_m=0.2, least_near=0.9, settled_m=5e-3, iterations=20),
+        view_turn_rad=3.2,
+        view_lead=0.97,
+    )
+    map_trunks: TrunkConfig = TrunkConfig(cell_m=0.2, least_points=6, roundness_m=0.12)
+    """Of the map, whose voxels are coarse."""
+    reach_m: Positive = 20.0  # of the map about a guess that takes part in registration
+    thin_m: Positive = 0.12  # of the views
+    agree_m: Positive = 0.5  # two views that name places nearer than this say the same
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """Where the newest view's frame is in the map: x_map = R x_view + p."""
+
+    R: Array  # (3, 3)
+    p: Array  # (3,), m
+    near: float  # share of the view's points that have one of the map near
+    by: str  # "trunks" or "view"
+
+
+class Locator:
+    """One map, many questions.
+
+    >>> locator = Locator(points_map, ground_z, eyes_map, LocateConfig())
+    >>> located = locator.look(points_view)
+    """
+
+    def __init__(self, points_map: Array32, eyes_map: Array, config: LocateConfig) -> None:
+        """Occupied points (N, 3) and where the vehicle may be (M, 3), at its height, m, z up."""
+        if not len(points_map):
+            raise InputError("nothing is occupied", field="map", valid="a map of a flight")
+        self.config = config
+        self._points, self._eyes = points_map, eyes_map
+        trunks = detect_trunks(points_map.astype(np.float64), config.map_trunks)
+        self.sky = constellation(trunks.centers, config.compare.constellation)
+        self._panoramas: Array32 | None = None  # only asked for where no trunks stand
+        self._hits: HitMap | None = None
+
+    def look(self, points_view: Array32) -> Located | None:
+        """Find the levelled frame of points (N, 3), m, its origin at the vehicle; None: not sure."""
+        seen = detect_trunks(points_view.astype(np.float64), self.config.compare.trunks)
+        sky = constellation(seen.centers, self.config.compare.constellation)
+        place = accepted(match(self.sky, sky, self.config.compare.constellation), self.config.compare.constellation)
+        if place is not None:
+            return _located(self._by_trunks(place, points_view), "trunks")
+        return _located(self._by_view(points_view), "view")
+
+    def _by_trunks(self, place: Place, points_view: Array32) -> Alignment | None:
+        near = self._about(place.p_map)
+        if not len(near):
+            return None
+        eye = self._eyes[np.argmin(np.linalg.norm(self._eyes[:, :2] - place.p_map, axis=1))]
+        guess = turn_z(place.yaw), np.array([*place.p_map, eye[2]])
+        return align(near, points_view, guess, self.config.compare.verify)
+
+    def _by_view(self, points_view: Array32) -> Alignment | None:
+        compare = self.config.compare
+        if self._panoramas is None or self._hits is None:
+            self._panoramas = panoramas(self._points, self._eyes, compare.view)
+            self._hits = HitMap(self._points, compare.correlate)
+        places = sights(self._panoramas, self._eyes, panorama(points_view, compare.view), compare.view)
+        return best_fit(self._points, self._hits, points_view, places, compare)
+
+    def _about(self, p_map: Array) -> Array32:
+        gap = self._points[:, :2] - p_map.astype(np.float32)
+        near: Array32 = self._points[np.einsum("ij,ij->i", gap, gap) < self.config.reach_m**2]
+        return near
+
+
+class Search:
+    """One search: feed it views about a second apart until it answers.
+
+    Each is looked up together with those before it. What trunks say is sure at once; what a panorama
+    says counts when the next view says it again, since halls and tunnels repeat themselves.
+    """
+
+    def __init__(self, locator: Locator) -> None:
+        self._locator = locator
+        self._seen: Array32 = np.empty((0, 3), np.float32)
+        self._guess: Located | None = None
+        self._thinner = Thinner()
+        self.views = 0
+
+    def look(self, points_view: Array32, R_step: Array, p_step: Array) -> Located | None:
+        """Take in a view (N, 3) and its pose, seen from the frame of the view before; None: not sure yet."""
+        moved = (self._seen - p_step.astype(np.float32)) @ R_step.astype(np.float32)
+        config = self._locator.config
+        self._seen = self._thinner.firsts(np.concatenate([moved, points_view]).astype(np.float32), config.thin_m)
+        self.views += 1
+        found, last = self._locator.look(self._seen), self._guess
+        self._guess = found
+        if found is None or found.by == "trunks":
+            return found
+        if last is None:
+            return None
+        gap_m = float(np.linalg.norm(last.R @ p_step + last.p - found.p))
+        return found if gap_m <= config.agree_m else None
+
+
+def _located(found: Alignment | None, by: str) -> Located | None:
+    return None if found is None else Located(found.R, found.p, found.near, by)
