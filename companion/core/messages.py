@@ -328,6 +328,8 @@ class PlanStatus:
     cost_m: float
     iterations: int
     reason: str = ""  # why it is blocked; PROVEN begins the words of a proof that there is no way
+    checked: int = 0  # ways that were traversed voxel by voxel before they were published
+    refused: int = 0  # of them, those that met something seen: braked on before it
 
 
 @message

@@ -10,6 +10,7 @@ from companion.planning.registry import PlannerSettings
 from companion.planning.route import RouteConfig
 from companion.planning.smooth import SmoothConfig
 from companion.planning.speed_profile import SpeedConfig
+from companion.planning.switch import SwitchConfig
 
 Metres = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -25,10 +26,7 @@ class PlanningConfig(PlannerSettings, frozen=True, forbid_unknown_fields=True, k
     """Flown before a new plan takes over: its latency and 0.1 s."""
     keep_slack_m: Metres = 0.1
     """The old route stays while it is at most this much nearer to obstacles than it was planned."""
-    switch_share: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.9
-    """A new route replaces a good old one if it is shorter than this share of it ..."""
-    switch_m: Metres = 0.3
-    """... less this."""
+    switch: SwitchConfig = SwitchConfig()
     most_strain: Annotated[float, msgspec.Meta(gt=0)] = 1.0
     """A new way that asks for more than this times the acceleration limit across it waits until the
     vehicle is slower."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from companion.core import topics
-from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, Trajectory
+from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, Trajectory, Why
 from companion.core.node import Node, Outputs, every, on
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import Flown
@@ -24,7 +24,7 @@ _STATUS_SPACING = 5  # every so manieth point of the route is shown
 class PlanningNode(Node):
     """Holds the newest inputs; `Replanner` decides."""
 
-    publishes = (topics.TRAJECTORY, topics.PLAN)
+    publishes = (topics.TRAJECTORY, topics.PLAN, topics.WHY)
 
     def __init__(self, config: PlanningConfig, *, hull_radius_m: float, seed: int) -> None:
         self.config = config
@@ -78,6 +78,9 @@ class PlanningNode(Node):
         flown = self._replanner.update(now)
         yield topics.TRAJECTORY(self._trajectory(odometry, goal, flown))
         yield topics.PLAN(self._status(odometry.stamp_ns))
+        for what, because in self._replanner.whys:
+            yield topics.WHY(Why(stamp_ns=odometry.stamp_ns, node="planning", what=what, because=because))
+        self._replanner.whys.clear()
 
     def _trajectory(self, odometry: Odometry, goal: Goal, flown: Flown) -> Trajectory:
         points, speeds = flown.ahead_until_stop
@@ -108,6 +111,8 @@ class PlanningNode(Node):
             cost_m=flown.reach_m if flown is not None else math.nan,
             iterations=replanner.iterations,
             reason=replanner.reason if replanner.state == "blocked" else "",
+            checked=replanner.checked,
+            refused=replanner.refused,
         )
 
 

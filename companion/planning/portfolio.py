@@ -41,8 +41,10 @@ class PortfolioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Expansions of the lattice per round while there is no way."""
     guided_expansions: Count = 100
     """And per round beside RRT*, in worlds where a wave was needed for the first way."""
-    easy_expansions: Count = 40
+    easy_expansions: Count = 10
     """And in easy ones."""
+    restarts: Annotated[int, msgspec.Meta(ge=0)] = 4
+    """Chunks of RRT-Connect that look for other first ways in easy worlds, before RRT* betters the best."""
     first_shortcuts: Count = 200
     """Attempts to shorten what RRT-Connect or the lattice found."""
     greed: Annotated[float, msgspec.Meta(ge=1)] = 3.0
@@ -91,7 +93,7 @@ class PortfolioSearch:
         self._is_swept = False  # was a wave sent?
         self._guide = NO_GUIDE
         self._is_new = True  # the first way is not shortened yet
-        self.samples = 0
+        self.samples = self._restarts = 0
 
     @property
     def solved(self) -> bool:
@@ -132,6 +134,10 @@ class PortfolioSearch:
             self._tree.shorten(rng, self._config.first_shortcuts)
             return
         config = self._config
+        if not self._is_swept and self._restarts < config.restarts:
+            self._restarts += 1
+            self._tree.join(rng)
+            return
         self._look(config.guided_expansions if self._is_swept else config.easy_expansions, rng)
         self._tree.grow(rng)
         self._tree.shorten(rng)

@@ -19,8 +19,10 @@ from companion.planning.registry import make_planner
 from companion.planning.route import Route, RouteFinder, Spaces
 from companion.planning.smooth import smooth
 from companion.planning.space import FieldSpace
-from companion.planning.speed_profile import known_free_m, spacing_of
+from companion.planning.standing import Standing
+from companion.planning.switch import better
 from companion.planning.target import at_height
+from companion.planning.verify import first_hit_m
 
 State = Literal["idle", "flying", "reached", "blocked"]
 
@@ -46,7 +48,10 @@ class Replanner:
         self.flown: Flown | None = None
         self.goal: Goal | None = None
         self.reached = False
-        self.iterations = self._fails = self._still = self._replans = self._proofs = 0
+        self._standing = Standing(config.speed, hull_radius_m=hull_radius_m, creep_after=config.creep_after)
+        self.iterations = self._fails = self._replans = self._proofs = 0
+        self.checked = self.refused = 0  # ways traversed before they were published, and of them braked on
+        self.whys: list[tuple[str, str]] = []  # what was decided, because of what, since the last look
         self._target: Array | None = None  # where the route leads; None: none yet
         self._goal_odom = np.zeros(3)  # the goal with its height from the ground
         self._planned_radius_m = hull_radius_m
@@ -56,7 +61,7 @@ class Replanner:
     def take_goal(self, goal: Goal) -> None:
         """A new goal; the way being flown stays until the next `update`."""
         self.goal, self.reached, self._begun = goal, False, False
-        self._fails = self._still = self._proofs = 0
+        self._fails = self._standing.still = self._proofs = 0
         self._target = None
 
     @property
@@ -75,7 +80,7 @@ class Replanner:
             return f"{PROVEN}: no free cells lead to the goal"
         if self._fails >= self.config.blocked_after:
             return f"no route found {self._fails} times in a row"
-        if self._still >= self.config.stuck_after:
+        if self._standing.still >= self.config.stuck_after:
             return "standing although there is a route"
         return ""
 
@@ -108,12 +113,22 @@ class Replanner:
         self._replans += 1
         if self._begun:
             self.look(now.p_odom, now.v_odom)
-        had = self.flown
+        first = self.flown is None
         fly = {"takeoff": self._take_off, "fly": self._fly, "hold": self._hold}[self.goal.kind]
-        self.flown = fly(self.goal, now)
+        self.flown = self._checked(fly(self.goal, now), now)
         self._begun = True
-        self._count_standing(now, had)
+        due = None if self.reached or first else self.flown
+        self._standing.count(due, self.goal, now.local_map, p_odom=now.p_odom, v_odom=now.v_odom)
         return self.flown
+
+    def _checked(self, flown: Flown, now: Situation) -> Flown:
+        """Nothing is published that was not traversed; what meets something is braked on before it."""
+        self.checked += 1
+        if math.isinf(hit_m := first_hit_m(flown, now.p_odom, now.local_map, radius_m=self.hull_radius_m)):
+            return flown
+        self.refused += 1
+        self.whys.append(("brake", f"the way meets something seen after {hit_m:.1f} m"))
+        return self._stopped(flown, now, stop_m=hit_m - 2.0 * self.config.speed.stop_margin_m)
 
     # --- kinds of goals ----------------------------------------------------------------
 
@@ -164,7 +179,7 @@ class Replanner:
         self._fails = 0
         self._target, self._at_border = route.target, route.at_border
         self._substitute, self.iterations = route.substitute, route.iterations
-        if old is not None and route.cost_m > self.config.switch_share * length(old) - self.config.switch_m:
+        if old is not None and not self._switches(route, old, spaces.widest):
             way, escape = old, old[:1]
         else:
             way, escape = route.path, route.escape
@@ -208,6 +223,14 @@ class Replanner:
             return old
         near = gap < max(0.5, 0.5 * length(old)) and space.segment_free(old[-1], route.target)
         return np.vstack([old, route.target]) if near else None
+
+    def _switches(self, route: Route, old: Array, space: FieldSpace) -> bool:
+        """Does the route replace a good old way? One around the other side of something only if it is far better."""
+        new = without_repeats(np.vstack([route.escape, route.path]))
+        replaces, same = better(new, old, space, self.config.switch)
+        if replaces and not same:
+            self.whys.append(("another way", f"{length(new):.1f} m instead of {length(old):.1f} m"))
+        return replaces
 
     def _without_route(self, kept: Commitment, old: Array | None, space: FieldSpace, now: Situation) -> Flown:
         """Keep the old way if it is good; else brake on it before what blocks it."""
@@ -259,7 +282,7 @@ class Replanner:
     ) -> Flown:
         config, limits = self.config, goal.limits
         known_m = self.hull_radius_m + limits.clearance
-        if self._still >= config.creep_after:
+        if self._standing.creeps:
             known_m = self.hull_radius_m + config.creep_margin_m
             limits = replace(limits, speed=min(limits.speed, config.creep_speed_m_s))
         if goal.kind == "takeoff":
@@ -275,26 +298,3 @@ class Replanner:
             reach_m=reach_m,
             stop_m=stop_m,
         )
-
-    def _count_standing(self, now: Situation, had: Flown | None) -> None:
-        """Standing although there is a way: first known space is asked for the hull alone."""
-        assert self.flown is not None
-        moves = float(np.linalg.norm(now.v_odom)) >= SLOW_M_S
-        if self.reached or had is None or (moves and self._still < self.config.creep_after):
-            self._still = 0
-        elif not moves:
-            points, _ = self.flown.ahead_until_stop
-            s, _ = project(points, now.p_odom)
-            self._still = self._still + 1 if length(points) - s < 0.3 else self._still
-        elif self._known_ahead_m(self.flown, now) > 2.0:
-            self._still = 0
-
-    def _known_ahead_m(self, flown: Flown, now: Situation) -> float:
-        """Way ahead that is known free with all the clearance asked for: then creeping may end."""
-        if self.goal is None or len(flown.points) < 2:
-            return 0.0
-        s = project(flown.points, now.p_odom)[0]
-        first = min(int(s / spacing_of(flown.points)), len(flown.points) - 1)
-        ahead = flown.points[first:]
-        radii_m = (self.hull_radius_m + self.goal.limits.clearance, self.hull_radius_m)
-        return min(known_free_m(ahead, now.local_map, self.config.speed, radii_m), length(ahead))

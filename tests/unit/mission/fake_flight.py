@@ -21,6 +21,7 @@ class FakeFlight:
     config: MissionConfig = field(default_factory=MissionConfig)
     refuse: tuple[str, ...] = ()  # commands that the autopilot refuses
     blocked: frozenset[int] = frozenset()  # goal ids without a way
+    reason: str = ""  # the planner's, of those
     frozen: frozenset[int] = frozenset()  # goal ids at which nothing moves
     ready_ns: int = 0
     p_map_odom: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -118,6 +119,7 @@ class FakeFlight:
                 m.PlanStatus(
                     stamp_ns=now, goal_id=self.goal.id, state=state, distance_m=0.0,
                     plan_p_odom=np.zeros((0, 3)), cost_m=0.0, iterations=0,
+                    reason=self.reason if state == "blocked" else "",
                 ),
             )  # fmt: skip
 

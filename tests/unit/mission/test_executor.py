@@ -11,6 +11,7 @@ from fake_flight import FakeFlight
 
 from companion.core import topics
 from companion.core.geometry import quaternion_from_yaw, rotate
+from companion.core.messages import PROVEN
 from companion.mission.config import MissionConfig
 
 HEAD = "version: 1\nname: test\n"
@@ -177,6 +178,18 @@ def test_on_fail_does_what_it_says_and_ends_on_the_ground(rule, state, what):
     assert flight.landed and not flight.armed
     retries = sum(w.startswith("retry") for w in flight.whys)
     assert retries == (2 if "retry" in rule else 0)
+
+
+def test_a_proof_that_there_is_no_way_is_acted_on_at_once():
+    text = mission("{do: goto, at: [8, 0, 2], id: go, on_fail: {do: land_here}}")
+    spent = []
+    for reason in (f"{PROVEN}: no free cells lead to the goal", "no route found 5 times in a row"):
+        flight = FakeFlight(text, blocked=frozenset({2}), reason=reason)
+        assert flight.until_over().state == "failed"
+        (asked,) = (now_s for now_s, name, sent in flight.said if name == topics.GOAL.name and sent.id == 2)
+        acted = [now_s for now_s, name, sent in flight.said if name == topics.WHY.name and "land here" in sent.what]
+        spent.append(acted[0] - asked)
+    assert spent[0] < 1.0 and spent[1] > 10.0
 
 
 def test_a_retry_can_succeed():

@@ -95,6 +95,7 @@ class Flight:
         self.setpoint, self.status, self.trajectory = None, None, None
         self.states, self.trace, self.speeds, self.late = [], [], [], []
         self.step_count = 0
+        self.verdict = ("ok", 1.0)  # of the guards
         self.obstacles = np.argwhere(occupied) * 0.2 + 0.1
         self.clearance_m = np.inf
 
@@ -131,7 +132,8 @@ class Flight:
         for node in (self.planning, self.tracking):
             list(node.handle(topics.ODOMETRY, odometry))
         if n % 5 == 0:
-            word = SafetyStatus(stamp_ns=self.now_ns, action="ok", speed_scale=1.0, reason="")
+            action, scale = self.verdict
+            word = SafetyStatus(stamp_ns=self.now_ns, action=action, speed_scale=scale, reason="")
             list(self.tracking.handle(topics.SAFETY, word))
         if n % 20 == 0:
             self._later(self.planning.handle(topics.LOCAL_MAP, self._map()))

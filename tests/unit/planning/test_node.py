@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from companion.core import topics
-from companion.core.messages import Odometry
+from companion.core.messages import PROVEN, Odometry
 from companion.planning import connect, grid, grow, shortcut, smooth, tree
 from companion.planning.config import PlanningConfig
 from companion.planning.node import PlanningNode
@@ -125,6 +125,18 @@ def test_an_enclosed_goal_is_blocked_after_so_many_replans_and_free_again_when_i
     bench.map = local_map(hall(), ground_z=0.1)
     trajectory, status = bench.plan()
     assert status.state == "flying" and np.allclose(trajectory.p_odom[-1], [15.0, 6.0, 2.0])
+
+
+def test_an_enclosed_goal_is_proven_within_a_second(flights, local_map):
+    occupied = hall()
+    occupied[60:90, 15:45] = True
+    occupied[68:82, 23:37] = False
+    flight = flights.Flight(local_map, occupied, [3.0, 6.0, 2.0], known=seen(occupied), half_m=20.0)
+    flight.run(0.5)
+    flight.send(flights.goal_at([15.0, 6.0, 2.0]))
+    assert flight.run(1.0, until=lambda f: f.status.state == "blocked")
+    assert flight.status.reason == f"{PROVEN}: no free cells lead to the goal"
+    assert np.linalg.norm(flight.vehicle.p - [3.0, 6.0, 2.0]) < 0.2
 
 
 def test_takeoff_goes_straight_up_through_unknown_but_not_into_a_branch(flights, local_map):
