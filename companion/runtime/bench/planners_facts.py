@@ -60,8 +60,8 @@ FACTS = {
     ),
     "portfolio": Facts(
         "as n grows",
-        "at the cell size: its lattice proves that there is no way",
-        "RRT-Connect and a coarse-to-fine lattice first, then as RRT*",
+        "at the cell size: a flood fill proves that there is no way",
+        "RRT-Connect, where that fails O(V) for a wave, then as RRT*",
         "flight: a first way at once also in hard places, then as RRT*",
     ),
     "rrt_star": Facts(
