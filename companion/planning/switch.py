@@ -27,9 +27,9 @@ class SwitchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """A new way of the same class replaces a good old one if it is shorter than this share of it ..."""
     same_m: Metres = 0.3
     """... less this."""
-    other_share: Share = 0.85
+    other_share: Share = 0.9
     """A way of another class must be shorter than this share ..."""
-    other_m: Metres = 0.5
+    other_m: Metres = 0.3
     """... less this."""
 
 

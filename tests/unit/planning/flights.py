@@ -86,11 +86,11 @@ class Eyes:
 class Flight:
     """Steps everything; read `vehicle`, `status`, `trace` (N, 3) and `clearance_m` (hull, true)."""
 
-    def __init__(self, local_map, occupied, start, *, gust=0.3, half_m=6.4, seed=1, known=None):
+    def __init__(self, local_map, occupied, start, *, gust=0.3, half_m=6.4, seed=1, known=None, config=None):
         self.make_map, self.half_m = local_map, half_m
         self.eyes = Eyes(occupied, known=known)
         self.vehicle = PointMass(start, gust=gust, seed=seed)
-        self.planning = PlanningNode(PlanningConfig(), hull_radius_m=HULL_M, seed=seed)
+        self.planning = PlanningNode(config or PlanningConfig(), hull_radius_m=HULL_M, seed=seed)
         self.tracking = TrackingNode(TrackingConfig())
         self.setpoint, self.status, self.trajectory = None, None, None
         self.states, self.trace, self.speeds, self.late = [], [], [], []

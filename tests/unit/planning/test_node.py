@@ -131,7 +131,8 @@ def test_an_enclosed_goal_is_proven_within_a_second(flights, local_map):
     occupied = hall()
     occupied[60:90, 15:45] = True
     occupied[68:82, 23:37] = False
-    flight = flights.Flight(local_map, occupied, [3.0, 6.0, 2.0], known=seen(occupied), half_m=20.0)
+    config = PlanningConfig(route=RouteConfig(planner="portfolio"))
+    flight = flights.Flight(local_map, occupied, [3.0, 6.0, 2.0], known=seen(occupied), half_m=20.0, config=config)
     flight.run(0.5)
     flight.send(flights.goal_at([15.0, 6.0, 2.0]))
     assert flight.run(1.0, until=lambda f: f.status.state == "blocked")
