@@ -6,10 +6,10 @@ seen through so often that they were at the lower clamp: such a cell is a *newco
 branch that no ray met for a while is hit again: such a cell is *proven*, and left alone.
 
 Every `period_s` a pass looks at the occupied cells that no ray has hit for three periods. Where
-`crowd` of them in one block of 8^3 are newcomers, these become unknown, whether or not rays come
-by: one look makes them free. Where rays have passed through `crowd` others, the evidence for these
-is cut to even odds, so that the next look decides. Nothing else decays: a branch loses a cell or
-two at a time, what walks leaves many.
+`crowd` of them in one block of 8^3 are newcomers, or a quarter of that beside such a block, these become
+unknown, whether or not rays come by: one look makes them free. Where rays have passed through `crowd`
+others, the evidence for these is cut to even odds, so that the next look decides. Nothing else
+decays: a branch loses a cell or two at a time, what walks leaves many.
 
 A cell that was forgotten and is hit again comes from unknown, so it is no newcomer: evidence of
 something that stays is lost once at most. In a loaded map only newcomers go, and back to free.
@@ -25,12 +25,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.core.errors import InputError
+from companion.mapping.blocks import BlockStore
 from companion.mapping.marks import CAME, FRESH, MISSED, PROVEN, QUIET, STILL
 from companion.mapping.rays import CELLS, WORDS
 from companion.mapping.sensor_model import UNKNOWN
 from companion.mapping.voxel_map import VoxelMap
 
 u64 = np.uint64
+_PART = 4  # so much smaller is what of a crowd may stand in the next block
+_AROUND = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.int64)
 
 
 class DecayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -77,7 +80,10 @@ def decay(voxels: VoxelMap, now_ns: int, config: DecayConfig, *, since_ns: int) 
     rows = np.flatnonzero(blocks.stirred[: blocks.count])
     changed = np.zeros(len(rows), np.bool_)
     kept = blocks.held if not config.erase_loaded else np.zeros_like(blocks.held)
-    _pass(rows, blocks.marks, (blocks.log_odds, kept), config.crowd, changed)
+    newcomers = np.zeros(len(rows), np.int64)
+    _count_newcomers(rows, blocks.marks, blocks.log_odds, newcomers)
+    crowded = _crowded(blocks, rows, newcomers, config.crowd)
+    _pass(rows, blocks.marks, (blocks.log_odds, kept), (config.crowd, crowded), changed)
     rows = rows[changed]
     if config.forget_unseen_s > 0.0:
         rows = np.concatenate([rows, _forget_unseen(voxels, now_ns, since_ns, config)])
@@ -97,9 +103,35 @@ def _forget_unseen(voxels: VoxelMap, now_ns: int, since_ns: int, config: DecayCo
     return rows
 
 
+def _crowded(
+    blocks: BlockStore, rows: NDArray[np.int64], newcomers: NDArray[np.int64], crowd: int
+) -> NDArray[np.bool_]:
+    """Whether (N,) a block holds a crowd of newcomers, or a part of one that stands in a block next to it."""
+    crowded = newcomers >= crowd
+    parts = np.flatnonzero(~crowded & (newcomers >= max(crowd // _PART, 1)))
+    around = blocks.xyz[rows[parts], None, :].astype(np.int64) + _AROUND
+    of_row = np.zeros(blocks.count + 1, np.bool_)  # the last, which row -1 means, stays False
+    of_row[rows[crowded]] = True
+    beside = of_row[blocks.rows_of(around.reshape(-1, 3))].reshape(len(parts), len(_AROUND))
+    crowded[parts] = beside.any(axis=1)
+    return crowded
+
+
 @njit(cache=True, nogil=True)
-def _pass(rows, marked, cells, crowd, changed):  # type: ignore[no-untyped-def]
+def _count_newcomers(rows, marked, log_odds, newcomers):  # type: ignore[no-untyped-def]
+    _, slots, _, (bits, _, _) = marked
+    gone, weak = np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64)
+    for n in range(rows.size):
+        slot = slots[rows[n]]
+        octets = log_odds[rows[n]].view(np.uint64)
+        for w in range(WORDS if slot != 0 else 0):
+            newcomers[n] += _judge(bits[slot], w, _occupied(octets, w), gone, weak)
+
+
+@njit(cache=True, nogil=True)
+def _pass(rows, marked, cells, crowds, changed):  # type: ignore[no-untyped-def]
     (_, slots, stirred, (bits, free, left)), (log_odds, held) = marked, cells
+    crowd, crowded = crowds
     gone, weak, occupied = np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64)
     for n in range(rows.size):
         stirred[rows[n]] -= 1
@@ -108,12 +140,12 @@ def _pass(rows, marked, cells, crowd, changed):  # type: ignore[no-untyped-def]
             continue
         marks, levels, keep = bits[slot], log_odds[rows[n]], held[rows[n]] != 0
         octets = levels.view(np.uint64)
-        newcomers, passed = 0, 0
+        passed = 0
         for w in range(WORDS):
             occupied[w] = _occupied(octets, w)
-            newcomers += _judge(marks, w, occupied[w], gone, weak)
+            _judge(marks, w, occupied[w], gone, weak)
             passed += _count(weak[w])
-        if newcomers < crowd:
+        if not crowded[n]:
             gone[:] = u64(0)
         if passed < crowd or keep:
             weak[:] = u64(0)
