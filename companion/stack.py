@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from companion.autopilot.node import AutopilotNode
 from companion.config import Config
 from companion.core.node import Node
-from companion.estimation.node import GraphNode, LioNode, LoopNode, PropagatorNode
+from companion.estimation.node import GraphNode, LioNode, LoopNode, ObstacleTracksNode, PropagatorNode
 from companion.estimation.warm_up import warm_up
 from companion.mapping.landmark_node import LandmarkNode
 from companion.mapping.node import MappingNode
@@ -20,15 +20,16 @@ from companion.sensors.node import SensorsNode
 from companion.tracking.node import TrackingNode
 
 NODES = (
-    SensorsNode, LioNode, PropagatorNode, GraphNode, LoopNode, MappingNode, LandmarkNode, PlanningNode,
-    TrackingNode, MissionNode, SafetyNode, AutopilotNode,
+    SensorsNode, LioNode, PropagatorNode, GraphNode, LoopNode, MappingNode, ObstacleTracksNode,
+    LandmarkNode, PlanningNode, TrackingNode, MissionNode, SafetyNode, AutopilotNode,
 )  # fmt: skip
 
 GROUPS: dict[str, tuple[type[Node], ...]] = {
     # One process each when the stack runs live: what control needs at once runs where control runs.
     "perception": (SensorsNode, LioNode),
     "graph": (GraphNode, LoopNode),
-    "world": (MappingNode, LandmarkNode, PlanningNode),  # the local map is too large to leave its process
+    # The local map is too large to leave its process.
+    "world": (MappingNode, ObstacleTracksNode, LandmarkNode, PlanningNode),
     "control": (PropagatorNode, TrackingNode, MissionNode, SafetyNode, AutopilotNode),
 }
 
@@ -44,8 +45,8 @@ def build(
 ) -> list[Node]:
     """The nodes of the stack (or some of them), ready to be run by `companion.runtime`.
 
-    Without a back end in `config.estimation` there is no GraphNode. `shelf` takes what of the map is far
-    away; None: that stays in memory.
+    Without a back end in `config.estimation` there is no GraphNode, and none follows obstacles if that
+    is off. `shelf` takes what of the map is far away; None: that stays in memory.
     """
     makers: dict[type[Node], Callable[[], Node]] = {
         SensorsNode: lambda: SensorsNode(config.sensors),
@@ -54,6 +55,7 @@ def build(
         GraphNode: lambda: GraphNode(config.estimation, config.rig),
         LoopNode: lambda: LoopNode(config.estimation.loops),
         MappingNode: lambda: MappingNode(config.mapping, config.rig, hull_radius_m=config.hull_radius_m, shelf=shelf),
+        ObstacleTracksNode: lambda: ObstacleTracksNode(config.estimation.obstacle_tracks),
         LandmarkNode: lambda: LandmarkNode(config.mapping.landmarks, config.rig),
         PlanningNode: lambda: PlanningNode(config.planning, hull_radius_m=config.hull_radius_m, seed=seed),
         TrackingNode: lambda: TrackingNode(config.tracking),
@@ -61,8 +63,11 @@ def build(
         SafetyNode: lambda: SafetyNode(config.safety, fence=mission.fence),
         AutopilotNode: lambda: AutopilotNode(config.autopilot, signing_key=signing_key),
     }
-    without = () if config.estimation.back_end == "graph" else (GraphNode,)
-    return [makers[kind]() for kind in only if kind not in without]
+    chosen = {
+        GraphNode: config.estimation.back_end == "graph",
+        ObstacleTracksNode: config.estimation.obstacle_tracks.enabled,
+    }
+    return [makers[kind]() for kind in only if chosen.get(kind, True)]
 
 
 def warm(config: Config, nodes: Sequence[Node]) -> None:

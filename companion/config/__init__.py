@@ -30,6 +30,7 @@ DELAY_MS: dict[str, dict[str, float]] = {
     "GraphNode": {"estimation/likelihood": 8.0},
     "LoopNode": {"estimation/registered_scan": 250.0},
     "MappingNode": {"estimation/registered_scan": 42.0},
+    "ObstacleTracksNode": {"estimation/registered_scan": 5.0},
     "LandmarkNode": {"sensors/camera": 20.0},
     "PlanningNode": {"mapping/local_map": 40.0, "mission/goal": 40.0},
 }

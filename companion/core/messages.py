@@ -174,6 +174,24 @@ class MapFromOdom:
     closures: int  # that hold
 
 
+@message
+class ObstacleTracks:
+    """Things that move, one row each, by id: Kalman filters of constant velocity.
+
+    Axes are alike and apart: a row's covariance of (p, v) is [[a, c], [c, b]] for each axis, with a, b and c the
+    variances of position and velocity and what they share.
+    """
+
+    stamp_ns: int  # of the scan
+    id: NDArray[np.int64]  # (N,), never given twice
+    position_odom: Array  # middle of what is seen of it, m, (N, 3)
+    velocity_odom: Array  # m/s, (N, 3)
+    position_variance: Array  # m2, (N,)
+    velocity_variance: Array  # m2/s2, (N,)
+    cross_covariance: Array  # m2/s, (N,)
+    radius_m: Array  # half its width in plan, as seen, (N,)
+
+
 # --- mapping ------------------------------------------------------------------------
 
 

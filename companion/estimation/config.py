@@ -11,6 +11,7 @@ from companion.estimation.graph import GraphConfig
 from companion.estimation.lio import LioConfig
 from companion.estimation.loop_node import LoopNodeConfig
 from companion.estimation.ordering import OrderConfig
+from companion.estimation.tracks.node import ObstacleTracksConfig
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -34,3 +35,4 @@ class EstimationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     back_end: Literal["graph", "none"] = "graph"  # none: the filter alone, for small computers; map stays odom
     graph: GraphConfig = GraphConfig()
     loops: LoopNodeConfig = LoopNodeConfig()
+    obstacle_tracks: ObstacleTracksConfig = ObstacleTracksConfig()

@@ -25,6 +25,7 @@ FRAMES: dict[type[Any], str] = {  # header.frame_id, where there is one
     **dict.fromkeys((m.LioState, m.PoseLikelihood, m.Odometry, m.LocalMap, m.MapDelta, m.Goal), "odom"),
     **dict.fromkeys((m.Trajectory, m.PlanStatus, m.Setpoint, m.VehicleStatus), "odom"),
     m.Landmarks: "odom",
+    m.ObstacleTracks: "odom",
     m.PoseCorrections: "odom",
     m.MapFromOdom: "map",
     m.RegisteredScan: "base_link",

@@ -202,7 +202,7 @@ def test_without_recorded_sensors_the_other_nodes_are_replayed(flight, tmp_path)
     replay = run(log)
     assert replay.identical
     assert list(replay.blocked) == [
-        *("SensorsNode", "LioNode", "LoopNode", "MappingNode", "LandmarkNode", "PlanningNode")
+        *("SensorsNode", "LioNode", "LoopNode", "MappingNode", "ObstacleTracksNode", "LandmarkNode", "PlanningNode")
     ]
     assert replay.blocked["PlanningNode"] == ("mapping/local_map", "MappingNode")
     assert list(replay.reports) == [k.__name__ for k in NODES if k.__name__ not in replay.blocked]

@@ -23,7 +23,7 @@ FIXED = {  # shapes of arrays that are no (3,)
     "next_p_odom": (2, 3), "plan_p_odom": (7, 3), "speed": (7,), "points_body": (9, 3), "miss_dirs_body": (0, 3),
     "points_sensor": (9, 3), "point_age_s": (9,), "miss_dirs_sensor": (4, 3), "miss_age_s": (4,), "pixels": (3, 5),
     "state": (2, 3, 4), "distance_m": (2, 3, 4), "unknown_distance_m": (2, 3, 4), "ground_z_odom": (2, 3),
-    "position_odom": (3, 3),
+    "position_odom": (3, 3), "velocity_odom": (3, 3),
 }  # fmt: skip
 Fill = Callable[[Any, np.random.Generator], dict[str, Any]]
 

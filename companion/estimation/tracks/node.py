@@ -1,0 +1,91 @@
+"""Registered scans and local maps in, tracks of moving obstacles out."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.geometry import rotation_from_quaternion
+from companion.core.messages import LocalMap, ObstacleTracks, RegisteredScan
+from companion.core.node import Node, Outputs, on
+from companion.core.topics import LOCAL_MAP, OBSTACLE_TRACKS, REGISTERED
+from companion.estimation.tracks.tracker import Tracker, TrackerConfig
+from companion.estimation.tracks.unexpected import Background, ClusterConfig, clusters, unexpected
+
+_MAPS = 12  # kept at most
+
+
+class ObstacleTracksConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Tracks of what moves."""
+
+    enabled: bool = True
+    map_age_s: Annotated[float, msgspec.Meta(gt=0, le=2)] = 0.8  # of the map that says what is expected, at least
+    clusters: ClusterConfig = ClusterConfig()
+    tracker: TrackerConfig = TrackerConfig()
+
+
+class ObstacleTracksNode(Node):
+    """Compares each scan with the map of a moment ago; publishes the tracks that are believed, if there are any.
+
+    Tracks live in `odom`. After the last one is gone one empty message says so.
+    """
+
+    publishes = (OBSTACLE_TRACKS,)
+
+    def __init__(self, config: ObstacleTracksConfig) -> None:
+        self.config = config
+        self.tracker = Tracker(config.tracker)
+        self._maps: deque[Background] = deque(maxlen=_MAPS)
+        self._said = 0
+        _compile(config.clusters)
+
+    @on(LOCAL_MAP)
+    def map(self, local_map: LocalMap) -> None:
+        """Keep its states for later."""
+        kept = Background(local_map.stamp_ns, local_map.origin_odom, local_map.resolution_m, local_map.state)
+        self._maps.append(kept)
+
+    @on(REGISTERED)
+    def scan(self, scan: RegisteredScan) -> Outputs:
+        """Follow what the map did not expect."""
+        known = self._expected(scan.stamp_ns)
+        if known is None or scan.stamp_ns <= self.tracker.stamp_ns or not np.isfinite(scan.p_odom).all():
+            return
+        R = rotation_from_quaternion(scan.q_odom_body)
+        points = unexpected(scan.points_body, R, scan.p_odom, known, self.config.clusters)
+        self.tracker.update(clusters(points, self.config.clusters), scan.stamp_ns)
+        tracks = self.tracker.confirmed
+        if tracks or self._said:
+            yield OBSTACLE_TRACKS(self._message(scan.stamp_ns))
+        self._said = len(tracks)
+
+    def _expected(self, stamp_ns: int) -> Background | None:
+        """The newest map that is old enough; older ones are let go."""
+        age_ns = round(self.config.map_age_s * 1e9)
+        while len(self._maps) > 1 and self._maps[1].stamp_ns <= stamp_ns - age_ns:
+            self._maps.popleft()
+        return self._maps[0] if self._maps and self._maps[0].stamp_ns <= stamp_ns - age_ns else None
+
+    def _message(self, stamp_ns: int) -> ObstacleTracks:
+        tracks = self.tracker.confirmed
+        x = np.array([t.filter.x for t in tracks]).reshape(-1, 6)
+        P = np.array([t.filter.P for t in tracks]).reshape(-1, 6, 6)
+        return ObstacleTracks(
+            stamp_ns=stamp_ns,
+            id=np.array([t.id for t in tracks], np.int64),
+            position_odom=x[:, :3].copy(),
+            velocity_odom=x[:, 3:].copy(),
+            position_variance=P[:, 0, 0].copy(),
+            velocity_variance=P[:, 3, 3].copy(),
+            cross_covariance=P[:, 0, 3].copy(),
+            radius_m=np.array([t.radius_m for t in tracks], np.float64),
+        )
+
+
+def _compile(config: ClusterConfig) -> None:
+    """Kernels, before the flight."""
+    free = Background(0, np.zeros(3), 1.0, np.ones((3, 3, 3), np.uint8))
+    clusters(unexpected(np.full((1, 3), 0.5, np.float32), np.eye(3), np.ones(3), free, config), config)

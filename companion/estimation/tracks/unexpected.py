@@ -1,0 +1,110 @@
+"""Which points of a scan the map of a moment ago did not expect, and which of them belong together.
+
+A point in the midst of space that was seen free is where something has come to. The map must be
+older than the thing's stay there, else the thing is in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from companion.core.messages import Array, Array32
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+_FREE = 1
+
+
+class ClusterConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What counts as one thing."""
+
+    range_m: Positive = 15.0  # of points looked at
+    join_m: Positive = 0.5  # points nearer than this are of one thing
+    min_points: Annotated[int, msgspec.Meta(ge=1)] = 6
+    max_points: Annotated[int, msgspec.Meta(ge=10)] = 1500  # of a scan that are clustered: the first, evenly thinned
+    max_width_m: Positive = 1.6  # in plan; what is wider is no single thing
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """States of a local map (0 unknown, 1 free, 2 occupied), (X, Y, Z), from `origin_odom` on."""
+
+    stamp_ns: int
+    origin_odom: Array  # (3,), m
+    resolution_m: float
+    state: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Clusters:
+    """Things seen, ordered by their first point."""
+
+    centre_odom: Array  # (N, 3), m
+    radius_m: Array  # half the widest extent in plan, (N,)
+    points: NDArray[np.int64]  # (N,)
+
+
+def unexpected(points_body: Array32, R: Array, p: Array, known: Background, config: ClusterConfig) -> Array:
+    """Points (M, 3) in odom of a scan (N, 3) at the pose (R, p) whose cell and its 26 neighbours were all free."""
+    found = np.empty((len(points_body), 3))
+    place = (known.origin_odom, 1.0 / known.resolution_m)
+    count = _unexpected(points_body, np.ascontiguousarray(R), p, known.state, place, config.range_m**2, found)
+    return found[:count]
+
+
+def clusters(points_odom: Array, config: ClusterConfig) -> Clusters:
+    """Points (M, 3) joined into things; those too small or too wide are left out."""
+    points = points_odom[:: max(1, -(-len(points_odom) // config.max_points))]
+    if len(points) < config.min_points:
+        return Clusters(np.empty((0, 3)), np.empty(0), np.empty(0, np.int64))
+    pairs = cKDTree(points).query_pairs(config.join_m, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    count, label = connected_components(links, directed=False)
+    sizes = np.bincount(label, minlength=count)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, label, points)
+    np.maximum.at(high, label, points)
+    width = (high - low)[:, :2].max(axis=1)
+    kept = (sizes >= config.min_points) & (width <= config.max_width_m)
+    return Clusters(0.5 * (low + high)[kept], 0.5 * width[kept], sizes[kept])
+
+
+@njit(cache=True, nogil=True)
+def _unexpected(points, R, p, state, place, range2, found):  # type: ignore[no-untyped-def]
+    origin, per_m = place
+    nx, ny, nz = state.shape
+    count = 0
+    for n in range(points.shape[0]):
+        a, b, c = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
+        if a * a + b * b + c * c > range2:
+            continue
+        x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0]
+        y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + p[1]
+        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + p[2]
+        i = np.int64(np.floor((x - origin[0]) * per_m))
+        j = np.int64(np.floor((y - origin[1]) * per_m))
+        k = np.int64(np.floor((z - origin[2]) * per_m))
+        if i < 1 or j < 1 or k < 1 or i + 1 >= nx or j + 1 >= ny or k + 1 >= nz or state[i, j, k] != _FREE:
+            continue
+        if _all_free(state, i, j, k):
+            found[count, 0], found[count, 1], found[count, 2] = x, y, z
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _all_free(state, i, j, k):  # type: ignore[no-untyped-def]
+    for u in range(i - 1, i + 2):
+        for v in range(j - 1, j + 2):
+            for w in range(k - 1, k + 2):
+                if state[u, v, w] != _FREE:
+                    return False
+    return True
