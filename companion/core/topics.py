@@ -43,7 +43,7 @@ ODOMETRY = Topic("estimation/odometry", m.Odometry, 100.0, deadline_s=0.2, servi
 SMOOTHED = Topic("estimation/smoothed", m.SmoothedState, 10.0)
 CORRECTIONS = Topic("estimation/corrections", m.PoseCorrections, 0.0, service="latched")
 MAP_FROM_ODOM = Topic("estimation/map_from_odom", m.MapFromOdom, 0.0, service="latched")
-OBSTACLE_TRACKS = Topic("estimation/obstacle_tracks", m.ObstacleTracks, 0.0)  # 10 Hz while there are any
+OBSTACLE_TRACKS = Topic("estimation/obstacle_tracks", m.ObstacleTracks, 0.0)  # 5 Hz while there are any
 # mapping
 LOCAL_MAP = Topic("mapping/local_map", m.LocalMap, 5.0, recorded=False, deadline_s=1.0, service="bulk")
 MAP_STATUS = Topic("mapping/status", m.MapStatus, 5.0, deadline_s=1.0)

@@ -23,12 +23,13 @@ class ObstacleTracksConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
 
     enabled: bool = True
     map_age_s: Annotated[float, msgspec.Meta(gt=0, le=2)] = 0.8  # of the map that says what is expected, at least
+    every_scans: Annotated[int, msgspec.Meta(ge=1, le=5)] = 2  # scans per look
     clusters: ClusterConfig = ClusterConfig()
     tracker: TrackerConfig = TrackerConfig()
 
 
 class ObstacleTracksNode(Node):
-    """Compares each scan with the map of a moment ago; publishes the tracks that are believed, if there are any.
+    """Compares scans with the map of a moment ago; publishes the tracks that are believed, if there are any.
 
     Tracks live in `odom`. After the last one is gone one empty message says so.
     """
@@ -39,7 +40,7 @@ class ObstacleTracksNode(Node):
         self.config = config
         self.tracker = Tracker(config.tracker)
         self._maps: deque[Background] = deque(maxlen=_MAPS)
-        self._said = 0
+        self._said = self._scans = 0
         _compile(config.clusters)
 
     @on(LOCAL_MAP)
@@ -51,6 +52,9 @@ class ObstacleTracksNode(Node):
     @on(REGISTERED)
     def scan(self, scan: RegisteredScan) -> Outputs:
         """Follow what the map did not expect."""
+        self._scans += 1
+        if self._scans % self.config.every_scans:
+            return
         known = self._expected(scan.stamp_ns)
         if known is None or scan.stamp_ns <= self.tracker.stamp_ns or not np.isfinite(scan.p_odom).all():
             return
@@ -88,4 +92,5 @@ class ObstacleTracksNode(Node):
 def _compile(config: ClusterConfig) -> None:
     """Kernels, before the flight."""
     free = Background(0, np.zeros(3), 1.0, np.ones((3, 3, 3), np.uint8))
-    clusters(unexpected(np.full((1, 3), 0.5, np.float32), np.eye(3), np.ones(3), free, config), config)
+    found = unexpected(np.full((1, 3), 0.5, np.float32), np.eye(3), np.ones(3), free, config)
+    clusters(np.repeat(found, config.min_points, axis=0), config)

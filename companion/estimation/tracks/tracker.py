@@ -30,10 +30,10 @@ class TrackerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     sigma_m: Positive = 0.15  # of a cluster's middle about the thing's
     first_speed_m_s: Positive = 1.5  # sigma of a new track's velocity
     gate_nis: Positive = 16.3  # 99.9 % of three axes
-    hits: Count = 4  # clusters until it is believed ...
+    hits: Count = 3  # clusters until it is believed ...
     moved_m: Positive = 0.6  # ... and way from where it was first seen
     patience_s: Positive = 1.0  # without a cluster, believed
-    doubt_s: Positive = 0.35  # without a cluster, not yet believed
+    doubt_s: Positive = 0.45  # without a cluster, not yet believed
 
 
 @dataclass(slots=True)
@@ -83,12 +83,11 @@ class Tracker:
         """Pairs whose sum of normalised innovations is least, none beyond the gate."""
         if not self.tracks or not len(seen.centre_odom):
             return []
-        noise = self._noise()
-        cost = np.empty((len(self.tracks), len(seen.centre_odom)))
-        for i, track in enumerate(self.tracks):
-            for k, centre in enumerate(seen.centre_odom):
-                nis = track.filter.innovation(centre, _SEE_POSITION, noise).nis
-                cost[i, k] = nis if nis < self.config.gate_nis else _NEVER
+        place = np.array([track.filter.x[:3] for track in self.tracks])
+        S = np.array([track.filter.P[:3, :3] for track in self.tracks]) + self._noise()
+        off = seen.centre_odom - place[:, None]
+        nis = np.einsum("tki,tij,tkj->tk", off, np.linalg.inv(S), off)
+        cost = np.where(nis < self.config.gate_nis, nis, _NEVER)
         rows, columns = linear_sum_assignment(cost)
         return [(self.tracks[i], int(k)) for i, k in zip(rows, columns, strict=True) if cost[i, k] < _NEVER]
 

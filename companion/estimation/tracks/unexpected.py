@@ -13,9 +13,6 @@ import msgspec
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from companion.core.messages import Array, Array32
 
@@ -29,7 +26,9 @@ class ClusterConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     range_m: Positive = 15.0  # of points looked at
     join_m: Positive = 0.5  # points nearer than this are of one thing
     min_points: Annotated[int, msgspec.Meta(ge=1)] = 6
-    max_points: Annotated[int, msgspec.Meta(ge=10)] = 1500  # of a scan that are clustered: the first, evenly thinned
+    max_points: Annotated[int, msgspec.Meta(ge=10, le=2000)] = (
+        400  # of a scan that are clustered: the first, evenly thinned
+    )
     max_width_m: Positive = 1.6  # in plan; what is wider is no single thing
 
 
@@ -65,9 +64,8 @@ def clusters(points_odom: Array, config: ClusterConfig) -> Clusters:
     points = points_odom[:: max(1, -(-len(points_odom) // config.max_points))]
     if len(points) < config.min_points:
         return Clusters(np.empty((0, 3)), np.empty(0), np.empty(0, np.int64))
-    pairs = cKDTree(points).query_pairs(config.join_m, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    count, label = connected_components(links, directed=False)
+    label = np.full(len(points), -1, np.int64)
+    count = _label(points, config.join_m**2, label)
     sizes = np.bincount(label, minlength=count)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, label, points)
@@ -75,6 +73,29 @@ def clusters(points_odom: Array, config: ClusterConfig) -> Clusters:
     width = (high - low)[:, :2].max(axis=1)
     kept = (sizes >= config.min_points) & (width <= config.max_width_m)
     return Clusters(0.5 * (low + high)[kept], 0.5 * width[kept], sizes[kept])
+
+
+@njit(cache=True, nogil=True)
+def _label(points, join2, label):  # type: ignore[no-untyped-def]
+    """Connected components, numbered by their first point; returns how many. Few points: every pair is looked at."""
+    n = points.shape[0]
+    queue = np.empty(n, np.int64)
+    count = 0
+    for first in range(n):
+        if label[first] >= 0:
+            continue
+        label[first], queue[0], size, head = count, first, 1, 0
+        while head < size:
+            a = queue[head]
+            head += 1
+            for b in range(n):
+                if label[b] < 0:
+                    dx, dy, dz = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1], points[a, 2] - points[b, 2]
+                    if dx * dx + dy * dy + dz * dz <= join2:
+                        label[b], queue[size] = count, b
+                        size += 1
+        count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)

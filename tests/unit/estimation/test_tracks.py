@@ -96,15 +96,15 @@ def hover(world, seconds, height_m=2.0):
 
 def test_a_walker_of_the_simulator_is_followed():
     """It passes 5 m off at 1 m/s: medians of the errors below 0.25 m and 0.2 m/s, and no ghost."""
-    options = {"walker_paths": [[[5, -7], [5, 7]]], "walker_speed_m_s": [1.0, 1.0], "walker_radius_m": 0.35}
-    world = load_world("empty", seed=1, options=options)
+    options = {"walker_paths": [[[5, -16], [5, 16]]], "walker_speed_m_s": [1.0, 1.0], "walker_radius_m": 0.35}
+    world = load_world("empty", seed=4, options=options)
     off, slip = [], []
     for stamp_ns, told in hover(world, 6):
         feet, ahead = (world.walkers.feet(stamp_ns + dt)[0] for dt in (0, SCAN_NS))
         for p, v in zip(told.position_odom, told.velocity_odom, strict=True) if told else ():
             off.append(np.linalg.norm((p - feet)[:2]))
             slip.append(np.linalg.norm((v - (ahead - feet) / 0.1)[:2]))
-    assert len(off) > 30
+    assert len(off) > 15
     assert np.median(off) < 0.25
-    assert np.max(off) < 0.9
+    assert np.max(off) < 0.5
     assert np.median(slip) < 0.2
