@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from companion.core import topics
 from companion.core.messages import Array, GroundTruth, MissionStatus, Odometry, PlanStatus, SafetyStatus, Why
@@ -55,10 +56,17 @@ class Track:
     q: Array  # wxyz, (N, 4)
 
     def at(self, times: Array) -> Track:
-        """Positions interpolated, attitudes of the nearest sample."""
+        """Interpolated, positions linearly, attitudes on the sphere; before and after: the end's pose.
+
+        A sample of the truth is 20 ms away from the next: its attitude as it is would tell 0.2 % of drift
+        where there is a tenth of that.
+        """
         p = np.column_stack([np.interp(times, self.t_s, self.p[:, k]) for k in range(3)])
-        nearest = np.clip(np.searchsorted(self.t_s, times), 0, len(self.t_s) - 1)
-        return Track(times, p, self.q[nearest])
+        if len(self.t_s) < 2:
+            return Track(times, p, np.repeat(self.q[:1], len(times), axis=0))
+        between = Slerp(self.t_s, Rotation.from_quat(self.q, scalar_first=True))
+        turned = between(np.clip(times, self.t_s[0], self.t_s[-1]))
+        return Track(times, p, turned.as_quat(scalar_first=True))
 
 
 def _track(messages: list[Any], position: str, attitude: str, zero_ns: int) -> Track:

@@ -8,7 +8,7 @@ import pytest
 from companion.core.geometry import quaternion_from_yaw, quaternion_multiply, rotate
 from companion.core.messages import GroundTruth, Odometry
 from companion.report.summary import aligned, drift_percent, path_length, trajectory_figures
-from companion.report.tracks import Tracks
+from companion.report.tracks import Track, Tracks
 
 HZ = 50
 
@@ -52,6 +52,15 @@ def test_a_perfect_estimate_has_no_error_whatever_its_frame():
 def test_a_scale_error_of_one_percent_drifts_one_percent():
     estimate, truth = aligned(fly(line(200), scale=1.01))
     assert drift_percent(estimate, truth) == pytest.approx(1.0, rel=1e-2)
+
+
+def test_turning_between_two_samples_of_the_truth_is_no_drift():
+    t = np.arange(0.0, 60.0, 0.01)
+    p = np.column_stack([4.0 * t, np.zeros(len(t)), np.full(len(t), 2.0)])
+    yaw = 0.8 * np.sin(2.0 * t)
+    q = np.array([quaternion_from_yaw(y) for y in yaw])
+    truth = Track(t[1::2], p[1::2], q[1::2])  # turning by up to 32 mrad between samples
+    assert drift_percent(Track(t, p, q), truth.at(t)) < 0.02
 
 
 def test_a_short_flight_tells_its_end_error_over_its_length():
