@@ -73,6 +73,11 @@ class SimNode(Node):
         self._pieces: tuple[Pending[LidarScan], ...] = ()
         self.left_out = {"lidar": 0, "camera": 0}  # sweeps and frames for which the renderer was too busy
 
+    @property
+    def imu_bias_body(self) -> Array:
+        """Present true biases of the companion's IMU, (6,): gyro rad/s, accelerometer m/s2."""
+        return np.concatenate([self._imu.gyro_bias_body, self._imu.accel_bias_body])
+
     @on(topics.MAVLINK_TX)
     def receive(self, msg: MavlinkBytes) -> None:
         """Bytes from the stack reach the autopilot."""

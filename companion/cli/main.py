@@ -72,6 +72,7 @@ GROUPS = {  # group -> help, command -> module and function
             "estimators": "bench_estimators:estimators",
             "mapping": "bench_mapping:mapping",
             "places": "bench_places:places",
+            "estimation": "bench_estimation:estimation",
             "planners": "bench_planners:planners",
             "planning": "bench_planning:planning",
             "tracking": "bench_tracking:tracking",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from companion.core.geometry import log_so3
 from companion.core.messages import Array
 from companion.estimation.propagation import propagate
 from companion.estimation.registration import Normal
@@ -53,6 +54,17 @@ class Filter:
         P = np.linalg.inv(posterior)
         self.P = 0.5 * (P + P.T)
         return normal
+
+    def hold(self, R: Array, p: Array, *, sigmas: Array) -> None:
+        """The pose is known to be (R, p) still, and the velocity zero.
+
+        `sigmas` (9,): rad, m, m/s, of theta_body, p and v. A plain Kalman update: errors are tiny at rest.
+        """
+        error = np.concatenate([log_so3(self.state.R.T @ R), p - self.state.p, -self.state.v])
+        gain = np.linalg.solve(self.P[:9, :9] + np.diag(sigmas**2), self.P[:9]).T
+        self.state.retract(gain @ error)
+        P = self.P - gain @ self.P[:9]
+        self.P = 0.5 * (P + P.T)
 
     @property
     def is_sound(self) -> bool:

@@ -23,6 +23,7 @@ from companion.estimation.filter import Filter
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagation import NODE, ImuNoise
 from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
+from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -34,11 +35,12 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     noise: ImuNoise = ImuNoise()
     start: StartConfig = StartConfig()
+    standing: StandingConfig = StandingConfig()
     gate: ScanGate = ScanGate()
-    map: PointMapConfig = PointMapConfig()
-    plane: PlaneConfig = PlaneConfig()
+    map: PointMapConfig = PointMapConfig(averaged=20)
+    plane: PlaneConfig = PlaneConfig(flatness_m=0.03, sigma_m=0.03)
     thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # one point per voxel of this edge is registered
-    points: Count = 1500  # and at most so many
+    points: Count = 2000  # and at most so many
     iterations: Count = 5
     min_planes: Annotated[int, msgspec.Meta(ge=6)] = 20  # fewer: the scan is not used
 
@@ -61,6 +63,7 @@ class Lio:
         self._nodes = np.empty((0, NODE))
         self._thinner = Thinner()
         self._densities = config.noise.densities
+        self._standing = Standing(start, config.standing)
         self._tracker = CameraTracker(camera or CameraConfig(), rig)
 
     @classmethod
@@ -73,6 +76,7 @@ class Lio:
         if len(imu):
             nodes = self.filter.predict(imu, self._densities)
             self._nodes = np.concatenate([self._nodes, nodes])[-_NODE_HISTORY:]
+            self._standing.watch(imu, self.filter)
 
     def update_lidar(self, points_sensor: Array32, age_s: Array32) -> ScanResult:
         """Take a sweep (N, 3) that ends now; `age_s` (N,) is now minus each point's time."""
@@ -116,6 +120,7 @@ class Lio:
         scan = PlaneRegistration(self.map, few, self.config.plane)
         normal = self.filter.update(scan.linearise, iterations=self.config.iterations, at_least=self.config.min_planes)
         move_nodes(self._nodes, before, self._pose())
+        self._standing.seen(normal)
         return normal
 
     def _is_known(self, normal: Normal) -> bool:

@@ -24,6 +24,7 @@ class PointMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     voxel_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # edge of a voxel
     spacing_m: Annotated[float, msgspec.Meta(gt=0)] = 0.15  # between points in a voxel
     points_per_voxel: Annotated[int, msgspec.Meta(ge=5, le=64)] = 8
+    averaged: Annotated[int, msgspec.Meta(ge=1, le=200)] = 1  # returns that a point is the mean of, at most
     max_voxels: Annotated[int, msgspec.Meta(ge=1)] = 1_000_000  # about 100 MB; then no more are added
 
 
@@ -35,6 +36,7 @@ class PointMap:
         size = config.max_voxels
         # Not touched until used: the system gives pages on demand.
         self.pool = np.empty((size, config.points_per_voxel, 3), np.float32)
+        self.weights = np.empty((size, config.points_per_voxel), np.uint8)  # returns in each point
         self.counts = np.zeros(size, np.int32)
         self._pool_keys = np.empty(size, np.int64)
         self._set_table(min(_FIRST_VOXELS, size))
@@ -50,10 +52,10 @@ class PointMap:
             _refill(self._pool_keys[: self.voxels], self.keys, self.value)
         c = self.config
         self.voxels, refused = _insert(
-            (self.keys, self.value, self._pool_keys, self.counts, self.pool, self.voxels),
+            (self.keys, self.value, self._pool_keys, self.counts, self.pool, self.weights, self.voxels),
             points_body,
             (np.ascontiguousarray(R), p),
-            (1.0 / c.voxel_m, c.spacing_m**2),
+            (1.0 / c.voxel_m, c.spacing_m**2, c.averaged),
         )
         self.refused += refused
 
@@ -78,9 +80,9 @@ def _refill(pool_keys, keys, value):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _insert(store, points, pose, limits):  # type: ignore[no-untyped-def]
-    keys, value, pool_keys, counts, pool, voxels = store
+    keys, value, pool_keys, counts, pool, weights, voxels = store
     R, p = pose
-    inverse, spacing2 = limits
+    inverse, spacing2, averaged = limits
     refused = 0
     for q in range(points.shape[0]):
         a, b, c = np.float64(points[q, 0]), np.float64(points[q, 1]), np.float64(points[q, 2])
@@ -102,13 +104,20 @@ def _insert(store, points, pose, limits):  # type: ignore[no-untyped-def]
             voxels += 1
         v = value[s]
         n = counts[v]
-        near = n >= pool.shape[1]
+        nearest, at = spacing2, -1
         for u in range(n):
-            if near:
-                break
             dx, dy, dz = pool[v, u, 0] - x, pool[v, u, 1] - y, pool[v, u, 2] - z
-            near = dx * dx + dy * dy + dz * dz < spacing2
-        if not near:
+            d = dx * dx + dy * dy + dz * dz
+            if d < nearest:
+                nearest, at = d, u
+        if at >= 0:
+            if weights[v, at] < averaged:
+                weights[v, at] += 1
+                share = 1.0 / weights[v, at]
+                pool[v, at, 0] += share * (x - pool[v, at, 0])
+                pool[v, at, 1] += share * (y - pool[v, at, 1])
+                pool[v, at, 2] += share * (z - pool[v, at, 2])
+        elif n < pool.shape[1]:
             pool[v, n, 0], pool[v, n, 1], pool[v, n, 2] = x, y, z
-            counts[v] = n + 1
+            weights[v, n], counts[v] = 1, n + 1
     return voxels, refused

@@ -6,9 +6,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from companion.core.geometry import (
-    quaternion_conjugate,
     quaternion_from_yaw,
     quaternion_multiply,
     rotate,
@@ -16,8 +16,8 @@ from companion.core.geometry import (
 )
 from companion.core.messages import Array
 from companion.report.tracks import Track, Tracks
+from companion.runtime import trajectory_error
 
-SEGMENT_M = 50.0  # drift is told over segments of this length, as in the KITTI benchmark
 MOVING_M_S = 0.3
 
 
@@ -115,23 +115,8 @@ def drift_percent(estimate: Track, truth: Track) -> float:
     """
     if len(truth.t_s) < 2:
         return float("nan")
-    p_est, p_true = estimate.p[::10], truth.p[::10]
-    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(p_true, axis=0), axis=1))]
-    ends = np.searchsorted(along, along + SEGMENT_M)
-    errors = [
-        _relative_error(p_est[j] - p_est[i], p_true[j] - p_true[i], estimate.q[i * 10], truth.q[i * 10])
-        for i, j in enumerate(ends)
-        if j < len(along)
-    ]
-    if errors:
-        return 100.0 * float(np.mean(errors)) / SEGMENT_M
-    return 100.0 * float(np.linalg.norm(p_est[-1] - p_true[-1])) / max(float(along[-1]), 1.0)
-
-
-def _relative_error(step_est: Array, step_true: Array, q_est: Array, q_true: Array) -> float:
-    seen = rotate(quaternion_conjugate(q_est), step_est)
-    true = rotate(quaternion_conjugate(q_true), step_true)
-    return float(np.linalg.norm(seen - true))
+    R_est, R_true = (Rotation.from_quat(t.q[::10], scalar_first=True).as_matrix() for t in (estimate, truth))
+    return trajectory_error.drift_percent(estimate.p[::10], truth.p[::10], R_est, R_true)
 
 
 _FIGURES: tuple[str, ...] = (

@@ -54,6 +54,26 @@ def track_error(
     )
 
 
+SEGMENT_M = 50.0
+
+
+def drift_percent(p: Array, p_true: Array, R: Array, R_true: Array) -> float:
+    """Mean relative translation error over 50 m segments of the true path, in percent.
+
+    Positions (N, 3) and attitudes (N, 3, 3) of the same times. Displacements are compared in the body frame of
+    the segment's start (A. Geiger et al., KITTI, CVPR 2012). A way under 50 m gets its end error over its length.
+    """
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(p_true, axis=0), axis=1))]
+    ends = np.searchsorted(along, along + SEGMENT_M)
+    begins = np.flatnonzero(ends < len(along))
+    if not len(begins):
+        return 100.0 * float(np.linalg.norm(p[-1] - p_true[-1])) / max(float(along[-1]), 1.0)
+    ends = ends[begins]
+    seen = np.einsum("nji,nj->ni", R[begins], p[ends] - p[begins])
+    true = np.einsum("nji,nj->ni", R_true[begins], p_true[ends] - p_true[begins])
+    return 100.0 * float(np.linalg.norm(seen - true, axis=1).mean()) / SEGMENT_M
+
+
 def align(source: Array, target: Array) -> Array:
     """`source` (N, D) after the rotation and shift that bring it nearest to `target` (N, D).
 

@@ -36,10 +36,10 @@ def slalom(*, top_m_s: float, gates: int = 4, pitch_m: float = 12.0, swing_m: fl
 
 def forest_course(cones: Array, *, top_m_s: float, length_m: float = 70.0, seed: int = 1) -> Course:
     """The planner's way, smoothed, from above the origin `length_m` to the east past trunks and branches."""
-    space = _space_of(cones, length_m)
+    space = space_of(cones, (-4.0, -15.0), (length_m + 4.0, 15.0))
     start, goal = np.array([0.0, 0.0, HEIGHT_M]), np.array([length_m, 0.0, HEIGHT_M])
     planner = make_planner("rrt_star", PlannerSettings())
-    plan = planner.plan(start, _free_near(space, goal), space, rng=np.random.default_rng(seed), iterations=4000)
+    plan = planner.plan(start, free_near(space, goal), space, rng=np.random.default_rng(seed), iterations=4000)
     if not plan.solved:
         raise CompanionError("no way through this forest: try another --seed")
     path = smooth(plan.path, space, SmoothConfig())
@@ -59,13 +59,13 @@ def paced(name: str, path: Array, *, top_m_s: float, space: FieldSpace | None = 
     return Course(name=name, points=points, speeds=speeds, limit_m_s=top_m_s, accel=ACCEL)
 
 
-def _space_of(cones: Array, length_m: float) -> FieldSpace:
-    """Cells that a cone touches, in a corridor around the way; the height is kept within a metre."""
-    low, high = np.array([-4.0, -15.0, 0.0]), np.array([length_m + 4.0, 15.0, 6.0])
+def space_of(cones: Array, low_xy: tuple[float, float], high_xy: tuple[float, float]) -> FieldSpace:
+    """Cells between two corners that a cone touches; the height is kept within a metre."""
+    low, high = np.array([*low_xy, 0.0]), np.array([*high_xy, 6.0])
     shape = np.round((high - low) / _RESOLUTION_M).astype(int)
     occupied = np.zeros(shape, bool)
     for cone in cones:
-        if -20.0 < cone[0] < length_m + 20.0 and abs(cone[1]) < 30.0:
+        if np.all(cone[:2] > low[:2] - 16.0) and np.all(cone[:2] < high[:2] + 16.0):
             _mark(occupied, low, cone)
     gap = (distance_transform_edt(~occupied) - 0.5) * _RESOLUTION_M
     distance = np.clip(gap, 0.0, _FIELD_M).astype(np.float32)
@@ -99,8 +99,8 @@ def _mark(occupied: np.ndarray, low: Array, cone: Array) -> None:
     occupied[tuple(cells[inside].T)] = True
 
 
-def _free_near(space: FieldSpace, goal: Array) -> Array:
-    """The goal, or the free place nearest to it."""
+def free_near(space: FieldSpace, goal: Array) -> Array:
+    """The goal (3,), or the free place nearest to it."""
     if bool(space.free(goal[None])[0]):
         return goal
     places = space.free_cells_near(goal, within_m=4.0)

@@ -217,6 +217,21 @@ def test_map_keeps_spacing_and_grows_without_losing_points():
     np.testing.assert_array_equal(target.points(), before)
 
 
+def test_points_of_the_map_become_the_mean_of_what_was_seen_there():
+    rng = np.random.default_rng(8)
+    spots = np.stack(np.meshgrid(np.arange(12), np.arange(12), [0.25]), axis=-1).reshape(-1, 3) * 0.5 + [0.25, 0.25, 0]
+    rms = {}
+    for averaged in (1, 30):
+        target = PointMap(PointMapConfig(averaged=averaged))
+        for _ in range(60):
+            target.insert((spots + rng.normal(0, 0.02, spots.shape)).astype(np.float32), np.eye(3), np.zeros(3))
+        off = np.linalg.norm(target.points()[:, None] - spots, axis=2).min(axis=1)
+        rms[averaged] = np.sqrt((off**2).mean())
+        assert len(target.points()) == len(spots)
+    assert rms[1] == pytest.approx(0.02 * 3**0.5, rel=0.15)
+    assert rms[30] == pytest.approx(0.02 * (3 / 30) ** 0.5, rel=0.15)
+
+
 def test_a_full_map_refuses_and_never_hangs():
     rng = np.random.default_rng(6)
     target = PointMap(PointMapConfig(max_voxels=500))

@@ -1,0 +1,133 @@
+"""`companion bench estimation`: accuracy, honesty and cost of the estimators, on recorded flights."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from companion.cli.bench_tracking import GUSTS, course_mission, one_of, speed_limits
+from companion.cli.bus_options import Json, say
+from companion.cli.flight_input import stack_config
+from companion.cli.simulation import open_simulator
+from companion.config import Config
+from companion.core.errors import InputError
+from companion.runtime.bench.estimation import EstimationRow, bench_flight
+from companion.runtime.bench.estimation_courses import ring, tour
+from companion.runtime.bench.estimation_faults import fault
+from companion.runtime.bench.estimation_peers import missing
+from companion.runtime.bench.estimation_recording import LOG, record_course
+
+WORLDS = {
+    "forest": "poisson,size_m=150,stems_per_ha=300,branches=4,roughness_m=0.15,margin_m=30",
+    "clearing": "poisson,size_m=150,stems_per_ha=300,branches=4,roughness_m=0.05,clearing_m=45,start_m=75/75,"
+    "margin_m=30",
+}
+COLUMNS = (
+    "flight", "fault", "estimator", "ATE m", "drift %", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",
+    "in 3 sigma", "rank",
+)  # fmt: skip
+
+
+def estimation(
+    courses: Annotated[str, typer.Option(help="Of forest, clearing; with commas.")] = "forest,clearing",
+    speeds: Annotated[str, typer.Option(help="Speed limits in the forest, m/s; 4 in the clearing.")] = "4,8",
+    seeds: Annotated[str, typer.Option(help="Seeds of world, gusts and sensors.")] = "1",
+    faults: Annotated[
+        list[str] | None, typer.Option("--fault", help="none, range_12,no_camera, lidar_gap_3@40, ...; repeatable.")
+    ] = None,
+    recordings: Annotated[Path | None, typer.Option(help="Where flights are kept and found again.")] = None,
+    flight: Annotated[Path | None, typer.Option(help="A flight flown with --record instead.")] = None,
+    with_peers: Annotated[bool, typer.Option("--peers/--no-peers", help="KISS-ICP and small_gicp, too.")] = True,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Override of the stack; repeatable.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Measure the estimators against the truth. Example: companion bench estimation --courses forest --speeds 4
+
+    Each flight is flown by the truth and recorded once, then replayed into the estimators. NEES is per degree of
+    freedom: 1 is honest. CPU times are those of this thread. JSON is also printed if standard output is no terminal.
+    """
+    if out is not None and not out.parent.is_dir():
+        raise InputError("no such folder", field="--out", file=str(out.parent))
+    asked = faults or ["none"]
+    for text in asked:
+        fault(text)
+    if with_peers and missing():
+        Console(stderr=True).print(f"no {', '.join(missing())}: pip install 'understory[bench]'", style="dim")
+    config, console, done = stack_config(None, tuple(set_ or ())), Console(), list[EstimationRow]()
+    plain = as_json or not console.is_terminal
+    with tempfile.TemporaryDirectory() as scratch:
+        folders = [(flight, flight.name)] if flight else _folders(courses, speeds, seeds, recordings or Path(scratch))
+        for row in _rows(folders, asked, config, with_peers=with_peers):
+            done.append(row)
+            if plain:
+                say(msgspec.json.encode(row).decode())
+            if out is not None:
+                out.write_bytes(msgspec.json.Encoder().encode_lines(done))
+    if not plain:
+        console.print(estimation_table(done))
+
+
+def _rows(
+    folders: Sequence[tuple[Path, str]] | Iterator[tuple[Path, str]],
+    faults: list[str],
+    config: Config,
+    *,
+    with_peers: bool,
+) -> Iterator[EstimationRow]:
+    for folder, name in folders:
+        yield from bench_flight(folder, name, faults, config, with_peers=with_peers)
+
+
+def _folders(courses: str, speeds: str, seeds: str, parent: Path) -> Iterator[tuple[Path, str]]:
+    """Folder and name of each flight; one that is not there is recorded now."""
+    for course in courses.split(","):
+        kind = one_of(course, ("forest", "clearing"), "--courses")
+        for speed in speed_limits(speeds) if kind == "forest" else [4.0]:
+            for seed in _seeds(seeds):
+                folder = parent / f"{kind}_{speed:g}_{seed}"
+                if not (folder / LOG).is_file():
+                    _record(kind, speed, seed, folder)
+                yield folder, folder.name
+
+
+def _record(kind: str, speed: float, seed: int, folder: Path) -> None:
+    console = Console(stderr=True)
+    console.print(f"recording {folder.name}", style="dim", highlight=False)
+    with open_simulator(WORLDS[kind], seed, GUSTS, 0, console) as sim:
+        course = tour(sim.world.cones, top_m_s=speed, seed=seed) if kind == "forest" else ring(top_m_s=speed)
+        record_course(course, folder, stack_config(None, ()), sim=sim.new_node(), mission=course_mission())
+
+
+def _seeds(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{text!r}", field="--seeds", valid="whole numbers, with commas") from None
+
+
+def estimation_table(rows: list[EstimationRow]) -> Table:
+    """The rows as people read them."""
+    table = Table(title="Estimators against the truth; NEES per degree of freedom")
+    for name in COLUMNS:
+        table.add_column(name, justify="left" if name in COLUMNS[:3] else "right")
+    for row in rows:
+        table.add_row(*cells(row))
+    return table
+
+
+def cells(row: EstimationRow) -> list[str]:
+    """One text per column."""
+    n = row.nees
+    parts = (n.tilt, n.yaw, n.velocity, n.gyro_bias, n.accel_bias, n.position) if n else (None,) * 6
+    return [
+        row.flight, row.fault, row.estimator, f"{row.ate_m:.3f}", f"{row.drift_percent:.3f}", f"{row.front_ms:.1f}",
+        f"{row.all_ms:.1f}", *("" if x is None else f"{x:.2f}" for x in (*parts, row.covered, row.quality_rank)),
+    ]  # fmt: skip

@@ -1,0 +1,113 @@
+"""Rows of `companion bench estimation`: our estimator, and peers, on recorded flights with and without faults.
+
+for row in bench_flight(folder, "forest 4 m/s", ["none", "range_12"], config):
+    print(row.ate_m, row.nees.position)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from companion.config import Config
+from companion.core.messages import Array
+from companion.core.rig import Rig
+from companion.runtime.bench.estimation_faults import fault
+from companion.runtime.bench.estimation_peers import Peer, peers
+from companion.runtime.bench.estimation_recording import true_biases
+from companion.runtime.bench.estimation_replay import Run, replay
+from companion.runtime.bench.estimation_score import (
+    Nees,
+    accuracy,
+    estimates_of,
+    nees_of,
+    rank_correlation,
+    truth_at,
+)
+
+OWN = "understory"
+PEER_RANGE_M = 60.0
+_OFFSETS_NS = (0, -50_000_000, -100_000_000)  # a peer may mean any part of a sweep; the best counts
+
+
+class EstimationRow(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One estimator on one flight; null: does not apply."""
+
+    flight: str
+    fault: str
+    estimator: str
+    ate_m: float
+    worst_m: float
+    drift_percent: float
+    length_m: float
+    front_ms: float  # CPU per sweep: filter with all sensors
+    all_ms: float  # propagator and graph, too
+    nees: Nees | None = None
+    covered: float | None = None  # share of the time in which the position error is within three published sigmas
+    quality_rank: float | None = None  # Spearman's, of published quality and accuracy
+    why: tuple[str, ...] = ()  # what the nodes said
+
+
+def bench_flight(
+    folder: Path, flight: str, faults: Sequence[str], config: Config, *, with_peers: bool
+) -> Iterator[EstimationRow]:
+    """One row per fault, and one per peer on the flight without faults."""
+    for text in faults:
+        others = peers(max_range_m=PEER_RANGE_M) if with_peers and text == "none" else {}
+        run = replay(folder, config.estimation, config.rig, spoil=fault(text), others=list(others.values()))
+        yield own_row(run, flight, text, true_biases(folder))
+        for name, peer in others.items():
+            yield peer_row(name, peer, run, flight, config.rig)
+
+
+def own_row(run: Run, flight: str, fault_text: str, biases: tuple[Array, Array] | None) -> EstimationRow:
+    """Figures of our run."""
+    e = estimates_of(run)
+    true = truth_at(run.truth, e.stamps_ns, R_first=e.R[0], p_first=e.p[0])
+    found = accuracy(e.stamps_ns, e.R, e.p, run.truth)
+    covered, rank = _published(run, R_first=e.R[0], p_first=e.p[0])
+    return EstimationRow(
+        flight=flight,
+        fault=fault_text,
+        estimator=OWN,
+        **msgspec.structs.asdict(found),
+        front_ms=run.cpu_ms_per_scan("LioNode"),
+        all_ms=run.cpu_ms_per_scan(),
+        nees=nees_of(e, true, biases),
+        covered=covered,
+        quality_rank=rank,
+        why=tuple(f"{w.stamp_ns * 1e-9:.1f} s: {w.what}: {w.because}" for w in run.why),
+    )
+
+
+def peer_row(name: str, peer: Peer, run: Run, flight: str, rig: Rig) -> EstimationRow:
+    """Figures of a peer; its poses of the sensor become poses of the body."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rig.lidar.R_body_sensor, rig.lidar.p_body
+    body = np.array([T @ pose @ np.linalg.inv(T) for pose in peer.poses])
+    stamps = np.array(peer.stamps_ns)
+    tries = [accuracy(stamps + offset, body[:, :3, :3], body[:, :3, 3], run.truth) for offset in _OFFSETS_NS]
+    best = min(tries, key=lambda found: found.ate_m)
+    cpu_ms = 1e3 * peer.cpu_s / len(stamps)
+    return EstimationRow(
+        flight=flight,
+        fault="none",
+        estimator=name,
+        **msgspec.structs.asdict(best),
+        front_ms=cpu_ms,
+        all_ms=cpu_ms,
+    )
+
+
+def _published(run: Run, *, R_first: Array, p_first: Array) -> tuple[float, float]:
+    """Of the odometry: share within three sigmas on every axis, and the rank of its quality."""
+    stamps = np.array([o.stamp_ns for o in run.odometry])
+    true = truth_at(run.truth, stamps, R_first=R_first, p_first=p_first)
+    off = np.array([o.p_odom for o in run.odometry]) - true.p
+    sigma = np.sqrt([o.pose_variance[3:] for o in run.odometry])
+    quality = np.array([o.quality for o in run.odometry])
+    within = (np.abs(off) <= 3.0 * sigma).all(axis=1)
+    return float(within.mean()), rank_correlation(quality, np.linalg.norm(off, axis=1))

@@ -1,0 +1,105 @@
+"""The bench of the estimators: its figures on errors that are known, and its faults."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from companion.core import topics
+from companion.core.errors import InputError
+from companion.core.messages import CameraImage, GroundTruth, ImuSample, LidarScan
+from companion.runtime.bench.estimation_faults import fault
+from companion.runtime.bench.estimation_score import (
+    GRAVITY,
+    Estimates,
+    Truth,
+    accuracy,
+    nees_of,
+    normalised,
+    rank_correlation,
+)
+
+
+def test_normalised_errors_of_an_honest_covariance_average_one():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(4, 4))
+    errors = rng.normal(size=(20_000, 4)) @ root.T
+    P = np.broadcast_to(root @ root.T, (20_000, 4, 4))
+    assert normalised(errors, P).mean() == pytest.approx(1.0, rel=0.03)
+    assert normalised(2 * errors, P).mean() == pytest.approx(4.0, rel=0.03)
+
+
+def test_each_part_of_a_drawn_state_is_honest():
+    """True states are drawn around the estimates from the covariance that these claim."""
+    rng = np.random.default_rng(2)
+    n = 6000
+    root = np.diag(np.repeat([2e-3, 0.02, 0.03, 1e-3, 0.02, 0.03], 3)) @ (np.eye(18) + 0.2 * rng.normal(size=(18, 18)))
+    e = rng.normal(size=(n, 18)) @ root.T
+    R = Rotation.random(n, rng=rng)
+    zero = np.zeros((n, 3))
+    g = GRAVITY - e[:, 15:]  # the truth is one and the same
+    stamps = np.arange(n) * 100_000_000
+    estimates = Estimates(stamps, R.as_matrix(), zero, zero, zero, zero, g, np.broadcast_to(root @ root.T, (n, 18, 18)))
+    true = Truth((R * Rotation.from_rotvec(e[:, :3])).as_matrix(), e[:, 3:6], e[:, 6:9], GRAVITY)
+    nees = nees_of(estimates, true, (stamps, e[:, 9:15]))
+    for part in ("tilt", "yaw", "velocity", "gyro_bias", "accel_bias", "position"):
+        assert getattr(nees, part) == pytest.approx(1.0, rel=0.08), part
+
+
+def test_accuracy_ignores_the_frame_and_sees_the_scale():
+    t = np.arange(0, 60, 0.1)
+    p = np.column_stack([4 * t, 3 * np.sin(t), np.cos(t)])
+    yaw = Rotation.from_euler("z", 0.3 * np.sin(t)[:, None])
+    truth = [
+        GroundTruth(
+            stamp_ns=round(s * 1e9), p_world=q, q_world_body=r, v_world=np.zeros(3), clearance_m=1.0, contact="",
+            armed=True, battery_fraction=1.0,
+        )
+        for s, q, r in zip(t, p, yaw.as_quat(scalar_first=True), strict=True)
+    ]  # fmt: skip
+    turn = Rotation.from_euler("zyx", [1.0, 0.1, -0.1])
+    stamps = np.array([m.stamp_ns for m in truth])
+    same = accuracy(stamps, (turn * yaw).as_matrix(), turn.apply(p) + np.array([1, 2, 3]), truth)
+    assert same.ate_m < 1e-9
+    assert same.drift_percent < 1e-9
+    scaled = accuracy(stamps, (turn * yaw).as_matrix(), 1.01 * turn.apply(p), truth)
+    assert scaled.drift_percent == pytest.approx(1.0, rel=0.02)
+
+
+def test_rank_correlation_has_the_sign_of_honesty():
+    error = np.array([0.1, 0.2, 0.3, 0.9])
+    assert rank_correlation(1 - error, error) == pytest.approx(1.0)
+    assert rank_correlation(error, error) == pytest.approx(-1.0)
+
+
+def scan(stamp_s):
+    points = np.array([[1, 0, 0], [0, 9, 0], [0, 0, 20]], np.float32)
+    return LidarScan(
+        stamp_ns=round(stamp_s * 1e9), points_sensor=points, point_age_s=np.zeros(3, np.float32),
+        miss_dirs_sensor=points[:0], miss_age_s=np.zeros(0, np.float32),
+    )  # fmt: skip
+
+
+def image(stamp_s, value):
+    return CameraImage(stamp_ns=round(stamp_s * 1e9), pixels=np.full((4, 6), value, np.uint8))
+
+
+def test_faults_do_what_their_names_say():
+    spoil = fault("range_10,no_camera,lidar_gap_2@5")
+    assert len(spoil(topics.LIDAR, scan(1.0)).points_sensor) == 2
+    assert spoil(topics.LIDAR, scan(5.5)) is None
+    assert spoil(topics.CAMERA, image(1.0, 9)) is None
+    frozen = fault("frozen_1@2")
+    assert frozen(topics.CAMERA, image(1.9, 7)).pixels[0, 0] == 7
+    assert frozen(topics.CAMERA, image(2.5, 8)).pixels[0, 0] == 7
+    assert frozen(topics.CAMERA, image(3.1, 9)).pixels[0, 0] == 9
+    assert fault("dark_1@0")(topics.CAMERA, image(0.5, 200)).pixels.max() < 8
+    sample = ImuSample(stamp_ns=10**10, angular_velocity_body=np.zeros(3), specific_force_body=np.zeros(3))
+    assert fault("imu_step_0.5@2")(topics.IMU, sample).specific_force_body[0] == 0.5
+    assert fault("clock_jump_0.3@2")(topics.IMU, sample).stamp_ns == 10_300_000_000
+    assert fault("none")(topics.IMU, sample) is sample
+
+
+@pytest.mark.parametrize("text", ["fog_3@2", "range_far", "lidar_gap"])
+def test_unknown_faults_are_named_with_what_is_valid(text):
+    with pytest.raises(InputError, match="range_METRES"):
+        fault(text)
