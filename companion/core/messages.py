@@ -90,6 +90,7 @@ class LioState:
     source: Literal["start", "lidar", "camera"]
     inlier_fraction: float  # of the registered points
     weakest_direction: float  # smallest normalised eigenvalue of the registration, 0..1
+    doubts: str = ""  # what the front end cannot vouch for: weak axes, sensors; "": nothing
 
 
 @message
@@ -131,8 +132,10 @@ class Odometry:
     pose_variance: Array  # diagonal, theta_body then p_odom, (6,)
     velocity_variance: Array  # (3,)
     measured_ns: int  # stamp of the newest LiDAR or camera update inside
-    quality: float  # 0..1, share of inliers; 0 when dead reckoning
+    quality: float  # 0..1, falls with the standard deviation of the position; 0 when dead reckoning or lost
     reset_counter: int
+    health: Literal["nominal", "degraded", "lost"] = "nominal"
+    health_reason: str = ""  # which sensor, which axis; "": nominal
 
 
 @message

@@ -17,6 +17,7 @@ from numba import njit
 from companion.core.messages import Array, Array32, Bytes2D
 from companion.core.rig import Rig
 from companion.estimation.filter import Filter
+from companion.estimation.image_gate import ImageGate, ImageGateConfig
 from companion.estimation.point_map import PointMap
 from companion.estimation.registration import Flags, Normal, PlaneConfig, find_planes
 
@@ -32,6 +33,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Tracking and the trust in it."""
 
     enabled: bool = True
+    image: ImageGateConfig = ImageGateConfig()
     tracks: Count = 120  # at most
     refill_below: Count = 60  # look for new corners when fewer are left
     min_tracks: Annotated[int, msgspec.Meta(ge=4)] = 8
@@ -60,10 +62,17 @@ class CameraTracker:
         self._pixels = np.empty((0, 2), np.float32)  # OpenCV's: the centre of the first pixel is 0
         self._anchors = np.empty((0, 3))
         self._ground_m = 0.0  # usual height of the anchors, a first guess of depth
+        self._gate = ImageGate(config.image)
+        self.objection = ""  # to the last image
+        self.renewed = 0.0  # share of the tracks that the last image began
 
     def update(self, pixels: Bytes2D, filter_: Filter, target: PointMap, planes: PlaneConfig) -> Normal | None:
         """Correct the filter with an image of its own time; None if too few tracks came along."""
-        normal = None
+        self.renewed, normal = 0.0, None
+        self.objection = self._gate.objection(pixels)
+        if self.objection:
+            self.forget()
+            return None
         if self._last is not None and len(self._pixels) >= self.config.min_tracks:
             self._follow(self._last, pixels, filter_)
             if len(self._pixels) >= self.config.min_tracks:
@@ -73,6 +82,11 @@ class CameraTracker:
             self._refill(pixels, filter_, target, planes)
         used = normal is not None and normal.used >= self.config.min_tracks
         return normal if used else None
+
+    def forget(self) -> None:
+        """Drop all tracks: the next image begins new ones."""
+        self._last = None
+        self._keep(np.zeros(len(self._pixels), np.bool_), self._pixels)
 
     def _follow(self, last: Bytes2D, pixels: Bytes2D, filter_: Filter) -> None:
         guess = self._project(filter_.state.R, filter_.state.p)
@@ -122,6 +136,7 @@ class CameraTracker:
             return
         found = np.asarray(corners, np.float32).reshape(-1, 2)
         anchors, good = self._anchor(found, filter_, target, planes)
+        self.renewed = float(good.sum()) / max(len(self._pixels) + int(good.sum()), 1)
         self._pixels = np.concatenate([self._pixels, found[good]])
         self._anchors = np.concatenate([self._anchors, anchors[good]])
 

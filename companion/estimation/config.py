@@ -8,6 +8,7 @@ import msgspec
 
 from companion.estimation.camera import CameraConfig
 from companion.estimation.graph import GraphConfig
+from companion.estimation.health import HealthConfig
 from companion.estimation.lio import LioConfig
 from companion.estimation.loop_node import LoopNodeConfig
 from companion.estimation.ordering import OrderConfig
@@ -20,9 +21,9 @@ class PropagatorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     """The odometry that control flies on."""
 
     rate_hz: Positive = 100.0
-    position_inflation: Positive = 5.0  # of sigma: the map's own error is not modelled
     drift_share: Annotated[float, msgspec.Meta(ge=0)] = 0.02  # of the way since the last scan, added to sigma
-    blind_after_s: Positive = 0.45  # without a scan: quality 0
+    blind_after_s: Positive = 0.45  # without a scan or an image: quality 0
+    health: HealthConfig = HealthConfig()
 
 
 class EstimationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

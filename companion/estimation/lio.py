@@ -20,6 +20,7 @@ from companion.estimation.camera import CameraConfig, CameraTracker
 from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
 from companion.estimation.downsample import Thinner
 from companion.estimation.filter import Filter
+from companion.estimation.map_error import MapError, MapErrorConfig
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagation import NODE, ImuNoise
 from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
@@ -39,6 +40,9 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     gate: ScanGate = ScanGate()
     map: PointMapConfig = PointMapConfig(averaged=20)
     plane: PlaneConfig = PlaneConfig(flatness_m=0.03, sigma_m=0.03)
+    map_error: MapErrorConfig = MapErrorConfig()
+    weak_below: Annotated[float, msgspec.Meta(ge=0)] = 0.005  # normalised eigenvalue: such an axis is named
+    lidar_out_s: Annotated[float, msgspec.Meta(gt=0)] = 0.25  # without a sweep: camera anchors drift
     thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # one point per voxel of this edge is registered
     points: Count = 2000  # and at most so many
     iterations: Count = 5
@@ -59,6 +63,8 @@ class Lio:
     def __init__(self, start: Filter, config: LioConfig, rig: Rig, camera: CameraConfig | None = None) -> None:
         self.filter, self.config = start, config
         self.map = PointMap(config.map)
+        self._map_error, self._track_error = MapError(), MapError()
+        self._scan_s = start.t_s  # when the last sweep was used
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
         self._nodes = np.empty((0, NODE))
         self._thinner = Thinner()
@@ -93,8 +99,20 @@ class Lio:
         normal = self._register(points_body) if self.map.voxels else None
         spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
         if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):
-            self.map.insert(spaced, state.R, state.p)
+            self._extend(spaced)
+            self._scan_s = self.filter.t_s
         return ScanResult(points_body, normal)
+
+    @property
+    def covariance(self) -> Array:
+        """Of the error state in odom, (18, 18): the filter's, and that of the map it measures against."""
+        state = self.filter.state
+        return self.filter.P + self._map_error.covariance(state) + self._track_error.covariance(state)
+
+    @property
+    def objection(self) -> str:
+        """Why the last image was not used; "": it was."""
+        return self._tracker.objection
 
     def turn_directions(self, dirs_sensor: Array32, age_s: Array32) -> Array32:
         """Directions (N, 3) of a sweep that ends now -> the body frame of now."""
@@ -112,16 +130,32 @@ class Lio:
         before = self._pose()
         normal = self._tracker.update(pixels, self.filter, self.map, self.config.plane)
         move_nodes(self._nodes, before, self._pose())
+        if self.filter.t_s - self._scan_s > self.config.lidar_out_s:
+            self._track_error.move(self.filter.state.p)
+            share = self._tracker.renewed * self.config.map_error.track_share
+            self._track_error.extend(self.filter.state, self.filter.P, share)
         return normal
 
     def _register(self, points_body: Array32) -> Normal:
         before = self._pose()
+        self._take_back_track_error()
         few = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
         scan = PlaneRegistration(self.map, few, self.config.plane)
         normal = self.filter.update(scan.linearise, iterations=self.config.iterations, at_least=self.config.min_planes)
         move_nodes(self._nodes, before, self._pose())
         self._standing.seen(normal)
         return normal
+
+    def _take_back_track_error(self) -> None:
+        """What the camera's own map may have drifted, a sweep can mend: it is the filter's to correct."""
+        self.filter.P = self.filter.P + self._track_error.covariance(self.filter.state)
+        self._track_error.reset()
+
+    def _extend(self, spaced: Array32) -> None:
+        state = self.filter.state
+        share = self.map.insert(spaced, state.R, state.p) / max(len(spaced), 1)
+        self._map_error.move(state.p)
+        self._map_error.extend(state, self.filter.P, share * self.config.map_error.share)
 
     def _is_known(self, normal: Normal) -> bool:
         """Whether the map should have explained the scan; a nearly empty one cannot."""

@@ -43,7 +43,7 @@ class LioNode(Node):
         self._lio: Lio | None = None
         self._checked_ns = -(2**62)
         self._zero_ns = self._time_ns = 0
-        self._trouble = ""
+        self._trouble = self._weak = ""
         self._order = self._new_order()
 
     @property
@@ -135,11 +135,19 @@ class LioNode(Node):
             gyro_bias_body=state.gyro_bias.copy(),
             accel_bias_body=state.accel_bias.copy(),
             gravity_odom=state.g.copy(),
-            covariance=lio.filter.P.copy(),
+            covariance=lio.covariance,
             source=source,
             inlier_fraction=normal.used / normal.offered if normal else 0.0,
             weakest_direction=normal.weakest if normal else 0.0,
+            doubts=self._doubts(lio, source, normal),
         )
+
+    def _doubts(self, lio: Lio, source: str, normal: Normal | None) -> str:
+        """Weak axes of the newest sweep, and what is wrong with the sensors."""
+        if source == "lidar" and normal is not None:
+            self._weak = ", ".join(normal.weak_axes(self._config.lio.weak_below))
+        doubts = [f"LiDAR blind in {self._weak}" if self._weak else "", lio.objection]
+        return "; ".join(d for d in doubts if d)
 
     def _likelihood(self, source: Literal["lidar", "camera"], normal: Normal) -> PoseLikelihood:
         return PoseLikelihood(

@@ -43,21 +43,25 @@ class PointMap:
         self.voxels = 0
         self.refused = 0  # points that found no room
 
-    def insert(self, points_body: Array32, R: Array, p: Array) -> None:
-        """Add points (N, 3), taken to the map by R @ x + p, where none is near already."""
+    def insert(self, points_body: Array32, R: Array, p: Array) -> int:
+        """Take points (N, 3) to the map by R @ x + p: new where none is near, else into the mean of the nearest.
+
+        Returns how many were new.
+        """
         while 2 * (self.voxels + len(points_body)) > len(self.keys) and self.voxels < self.config.max_voxels:
             if len(self.keys) >= table_size(self.config.max_voxels):
                 break
             self._set_table(len(self.keys))  # twice as large
             _refill(self._pool_keys[: self.voxels], self.keys, self.value)
         c = self.config
-        self.voxels, refused = _insert(
+        self.voxels, refused, added = _insert(
             (self.keys, self.value, self._pool_keys, self.counts, self.pool, self.weights, self.voxels),
             points_body,
             (np.ascontiguousarray(R), p),
             (1.0 / c.voxel_m, c.spacing_m**2, c.averaged),
         )
         self.refused += refused
+        return int(added)
 
     def points(self) -> Array32:
         """Every point of the map, (N, 3)."""
@@ -83,7 +87,7 @@ def _insert(store, points, pose, limits):  # type: ignore[no-untyped-def]
     keys, value, pool_keys, counts, pool, weights, voxels = store
     R, p = pose
     inverse, spacing2, averaged = limits
-    refused = 0
+    refused, added = 0, 0
     for q in range(points.shape[0]):
         a, b, c = np.float64(points[q, 0]), np.float64(points[q, 1]), np.float64(points[q, 2])
         x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0]
@@ -120,4 +124,5 @@ def _insert(store, points, pose, limits):  # type: ignore[no-untyped-def]
         elif n < pool.shape[1]:
             pool[v, n, 0], pool[v, n, 1], pool[v, n, 2] = x, y, z
             weights[v, n], counts[v] = 1, n + 1
-    return voxels, refused
+            added += 1
+    return voxels, refused, added

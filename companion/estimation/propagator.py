@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
 from companion.core.messages import Array, ImuSample, LioState, Odometry
 from companion.estimation.config import PropagatorConfig
+from companion.estimation.health import judge
 from companion.estimation.imu_buffer import ImuBuffer
 from companion.estimation.propagation import ImuNoise, propagate
 from companion.estimation.state import STATE, State
@@ -26,7 +29,7 @@ class Propagator:
         self._P = np.empty((0, 0))
         self._time_ns = self._base_ns = self._scan_ns = 0
         self._scan_p = np.zeros(3)
-        self._quality = 0.0
+        self._doubts = ""
         self._starts = 0
         self._published_ns = -(2**62)
 
@@ -38,7 +41,7 @@ class Propagator:
             return  # not started, or older than what is known
         if state.source != "camera":
             self._scan_ns, self._scan_p = state.stamp_ns, state.p_odom
-            self._quality = state.inlier_fraction
+        self._doubts = state.doubts
         self._state, self._P = _unpack(state), state.covariance.copy()
         self._time_ns = self._base_ns = state.stamp_ns
         if len(self._imu):
@@ -62,25 +65,32 @@ class Propagator:
             self._time_ns = stamp_ns
 
     def _odometry(self, state: State) -> Odometry:
-        blind = self._time_ns - self._scan_ns > self._config.blind_after_s * 1e9
+        variance = self._pose_variance(state)
+        sigma_m = float(np.sqrt(variance[3:].max()))
+        lidar_age_s = (self._time_ns - self._scan_ns) * 1e-9
+        config = self._config.health
+        health, reason = judge(sigma_m=sigma_m, lidar_age_s=lidar_age_s, doubts=self._doubts, config=config)
+        blind = self._time_ns - self._base_ns > self._config.blind_after_s * 1e9 or health == "lost"
         return Odometry(
             stamp_ns=self._time_ns,
             p_odom=state.p.copy(),
             q_odom_body=quaternion_from_rotation(state.R),
             v_odom=state.v.copy(),
             omega_body=self._imu.newest_rate - state.gyro_bias,
-            pose_variance=self._pose_variance(state),
+            pose_variance=variance,
             velocity_variance=self._P.diagonal()[6:9].copy(),
             measured_ns=self._base_ns,
-            quality=0.0 if blind else self._quality,
+            quality=0.0 if blind else math.exp(-sigma_m / config.quality_sigma_m),
             reset_counter=self._starts - 1,
+            health=health,
+            health_reason=reason,
         )
 
     def _pose_variance(self, state: State) -> Array:
-        """Position sigma inflated, plus a share of the way since the last scan."""
+        """The filter's and the map's, and for position a share of the way since the last scan."""
         variance = self._P.diagonal()[:6].copy()
         drift_m = self._config.drift_share * float(np.linalg.norm(state.p - self._scan_p))
-        variance[3:] = (self._config.position_inflation * np.sqrt(variance[3:]) + drift_m) ** 2
+        variance[3:] = (np.sqrt(variance[3:]) + drift_m) ** 2
         return variance
 
 

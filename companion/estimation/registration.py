@@ -53,6 +53,23 @@ class Normal:
         scale = float(np.trace(self.H[3:, 3:]))
         return float(np.linalg.eigvalsh(_LEVER @ self.H @ _LEVER / scale)[0]) if scale > 0 else 0.0
 
+    def weak_axes(self, below: float) -> list[str]:
+        """Names of the directions in which it says hardly anything, in odom: an axis, or a turn about one."""
+        scale = float(np.trace(self.H[3:, 3:]))
+        if scale <= 0:
+            return ["every axis"]
+        values, vectors = np.linalg.eigh(_LEVER @ self.H @ _LEVER / scale)
+        return [_named(v, self.R) for v in vectors[:, values < below].T]
+
+
+def _named(direction: Array, R: Array) -> str:
+    """Of a unit vector (6,) in lever coordinates: what of it is larger, shift or turn."""
+    turn, shift = R @ direction[:3], direction[3:]
+    is_shift = np.linalg.norm(shift) >= np.linalg.norm(turn)
+    axis = shift if is_shift else turn
+    x, y, z = axis / np.linalg.norm(axis) * (np.sign(axis[np.argmax(np.abs(axis))]) or 1.0)
+    return f"{'position along' if is_shift else 'turn about'} ({x:.1f} {y:.1f} {z:.1f})"
+
 
 class PlaneRegistration:
     """Linearises one scan at one pose after another, searching neighbours only when needed."""

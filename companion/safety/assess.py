@@ -51,7 +51,9 @@ class SafetyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     position_std_land_m: Metres = 3.0
     """Standard deviation of the position: land."""
     quality_slow: Share = 0.25
-    """Share of inliers below this, in the air: slow."""
+    """Quality of the odometry below this, in the air: slow."""
+    lost_land_s: Seconds = 5.0
+    """Odometry says that it is lost: brake; for longer than this: land."""
     battery_land_fraction: Share = 0.08
     """Battery below this: land."""
     fence_slow_m: Annotated[float, msgspec.Meta(ge=0)] = 1.0
@@ -74,11 +76,13 @@ class Health:
     lidar_age_s: float  # of the newest LiDAR update
     map_age_s: float
     position_std_m: float  # largest axis
-    quality: float  # share of inliers, 0..1
+    quality: float  # of the odometry, 0..1
     battery_fraction: float  # < 0 or NaN: not known
     fence_depth_m: float  # inside > 0, outside < 0; infinite: no fence
     outside_s: float  # how long outside the fence
     down: tuple[tuple[str, str], ...] = ()  # (node, reason) of what does not run
+    lost_s: float = 0.0  # how long the odometry has said that it is lost
+    lost_because: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +135,9 @@ def _estimate(h: Health, c: SafetyConfig) -> Iterator[Verdict]:
         land=c.position_std_land_m,
     )
     if not h.quality >= c.quality_slow:
-        yield Verdict("slow", f"only {h.quality:.0%} of the scan fits the map")
+        yield Verdict("slow", f"quality of the odometry {h.quality:.0%}")
+    if h.lost_because:
+        yield Verdict("land" if h.lost_s > c.lost_land_s else "hold", f"lost: {h.lost_because}")
 
 
 def _sensing(h: Health, c: SafetyConfig) -> Iterator[Verdict]:

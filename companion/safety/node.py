@@ -40,12 +40,15 @@ class SafetyNode(Node):
         self._p_map_home: Array | None = None
         self._airborne_ns: int | None = None
         self._outside_ns: int | None = None
+        self._lost_ns: int | None = None  # since when the odometry says so
         self._verdict = Verdict("ok", "")
         self._calm_ns: int | None = None  # since when the inputs ask for less
 
     @on(topics.ODOMETRY)
     def _take_odometry(self, message: Odometry) -> None:
         self._odometry = message
+        lost = message.health == "lost"
+        self._lost_ns = (message.stamp_ns if self._lost_ns is None else self._lost_ns) if lost else None
 
     @on(topics.VEHICLE)
     def _take_vehicle(self, message: VehicleStatus) -> None:
@@ -112,6 +115,8 @@ class SafetyNode(Node):
             fence_depth_m=depth_m,
             outside_s=_age_s(now_ns, self._outside_ns) if outside else 0.0,
             down=tuple(self._down.items()),
+            lost_s=_age_s(now_ns, self._lost_ns) if self._lost_ns is not None else 0.0,
+            lost_because=odometry.health_reason if odometry and odometry.health == "lost" else "",
         )
 
     def _follow(self, now_ns: int) -> None:

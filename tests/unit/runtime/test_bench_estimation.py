@@ -47,7 +47,7 @@ def test_each_part_of_a_drawn_state_is_honest():
 
 def test_accuracy_ignores_the_frame_and_sees_the_scale():
     t = np.arange(0, 60, 0.1)
-    p = np.column_stack([4 * t, 3 * np.sin(t), np.cos(t)])
+    p = np.column_stack([4 * t, 0.2 * np.sin(t), 0.2 * np.cos(t)])
     yaw = Rotation.from_euler("z", 0.3 * np.sin(t)[:, None])
     truth = [
         GroundTruth(
