@@ -23,6 +23,7 @@ class PropagatorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     rate_hz: Positive = 100.0
     drift_share: Annotated[float, msgspec.Meta(ge=0)] = 0.02  # of the way since the last scan, added to sigma
     blind_after_s: Positive = 0.45  # without a scan or an image: quality 0
+    reset_from_m: Positive = 0.3  # a correction beyond it, after a gap, counts as a reset: the autopilot must know
     health: HealthConfig = HealthConfig()
 
 

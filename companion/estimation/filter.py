@@ -23,6 +23,7 @@ class Filter:
     state: State
     P: Array
     t_s: float
+    surprise: float = 0.0  # squared Mahalanobis distance from the prior to the last update
 
     def predict(self, imu: Array, densities: Array) -> Array:
         """Run IMU pieces (N, 7) through the filter; returns the nodes passed, (N, 22)."""
@@ -30,14 +31,24 @@ class Filter:
         self.t_s += float(imu[:, 0].sum())
         return nodes
 
-    def update(self, linearise: Linearise, *, iterations: int, at_least: int) -> Normal:
+    def update(
+        self,
+        linearise: Linearise,
+        *,
+        iterations: int,
+        at_least: int,
+        begin: tuple[Array, Array] | None = None,
+    ) -> Normal:
         """Gauss-Newton on prior + measurement; nothing changes if fewer than `at_least` are used.
 
+        `begin` = (R, p): where iteration begins, if not at the prior's mean.
         Returns the normal equations of the last iteration. The prior's Jacobian is taken as
         the identity, since corrections are far below 0.1 rad.
         """
         prior = self.state.copy()
         information = np.linalg.inv(self.P)
+        if begin is not None:
+            self.state.R[:], self.state.p[:] = begin
         for _ in range(iterations):
             normal = linearise(self.state.R, self.state.p)
             if normal.used < at_least:
@@ -51,6 +62,8 @@ class Filter:
             self.state.retract(step)
             if _is_small(step):
                 break
+        moved = self.state.minus(prior)
+        self.surprise = float(moved @ information @ moved)
         P = np.linalg.inv(posterior)
         self.P = 0.5 * (P + P.T)
         return normal

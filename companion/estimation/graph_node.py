@@ -13,7 +13,7 @@ from companion.core.rig import Rig
 from companion.core.topics import IMU, LIKELIHOOD, LIO_STATE, SMOOTHED, WHY
 from companion.estimation.config import EstimationConfig
 from companion.estimation.graph import Smoothed, Smoother, StartNode
-from companion.estimation.imu_buffer import ImuBuffer
+from companion.estimation.imu_doubt import new_buffer
 
 _NEAREST_NS = 100_000  # two nodes keep this distance; what is closer belongs to one
 
@@ -29,7 +29,7 @@ class GraphNode(Node):
 
     def __init__(self, config: EstimationConfig, rig: Rig) -> None:
         self._config, self._rig = config, rig
-        self._imu = ImuBuffer()
+        self._imu = new_buffer(config.lio.imu_doubt)
         self._smoother: Smoother | None = None
         self._state: LioState | None = None
         self._zero_ns = self._time_ns = 0

@@ -14,7 +14,9 @@ _LONGEST_STEP_S = 0.02  # longer gaps are bridged in steps of this length
 class ImuBuffer:
     """Samples in stamp order; a bad or late one is refused and counted."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, most_rate_rad_s: float = np.inf, most_force_m_s2: float = np.inf) -> None:
+        """From these values on (any axis) the sensor is at its stop."""
+        self._most = np.repeat([most_rate_rad_s, most_force_m_s2], 3)
         self._stamps = np.empty(_CAPACITY, np.int64)
         self._values = np.empty((_CAPACITY, 6))
         self._count = 0
@@ -22,9 +24,9 @@ class ImuBuffer:
         self.refused = 0
 
     def append(self, sample: ImuSample) -> bool:
-        """Take a sample; False if it is not finite or not newer than the last one."""
+        """Take a sample; False if it is not finite, at the sensor's stop, or not newer than the last one."""
         values = np.concatenate([sample.angular_velocity_body, sample.specific_force_body])
-        if not np.isfinite(values).all() or not self._is_next(sample.stamp_ns):
+        if not (np.abs(values) < self._most).all() or not self._is_next(sample.stamp_ns):  # NaN is never below
             self.refused += 1
             return False
         if self._count == _CAPACITY:
@@ -59,6 +61,15 @@ class ImuBuffer:
     def newest_rate(self) -> Array:
         """Angular velocity of the newest sample, rad/s, (3,), biased."""
         return self._values[self._count - 1, :3].copy()
+
+    def longest_gap_s(self, start_ns: int, end_ns: int) -> float:
+        """Of the samples that fill (start, end], the longest time between two, in s."""
+        stamps = self._stamps[: self._count]
+        first = max(int(np.searchsorted(stamps, start_ns, side="right")) - 1, 0)
+        inside = stamps[first : int(np.searchsorted(stamps, end_ns)) + 1]
+        if not len(inside):
+            return (end_ns - start_ns) * 1e-9
+        return float(np.diff(np.append(inside, max(end_ns, int(inside[-1])))).max()) * 1e-9
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the buffer reaches back to a time."""

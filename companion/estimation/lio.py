@@ -20,10 +20,12 @@ from companion.estimation.camera import CameraConfig, CameraTracker
 from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
 from companion.estimation.downsample import Thinner
 from companion.estimation.filter import Filter
+from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
 from companion.estimation.map_error import MapError, MapErrorConfig
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagation import NODE, ImuNoise
 from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
+from companion.estimation.search import SearchConfig, search
 from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
 
@@ -41,6 +43,8 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     map: PointMapConfig = PointMapConfig(averaged=20)
     plane: PlaneConfig = PlaneConfig(flatness_m=0.03, sigma_m=0.03)
     map_error: MapErrorConfig = MapErrorConfig()
+    search: SearchConfig = SearchConfig()
+    imu_doubt: ImuDoubtConfig = ImuDoubtConfig()
     weak_below: Annotated[float, msgspec.Meta(ge=0)] = 0.005  # normalised eigenvalue: such an axis is named
     lidar_out_s: Annotated[float, msgspec.Meta(gt=0)] = 0.25  # without a sweep: camera anchors drift
     thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # one point per voxel of this edge is registered
@@ -55,6 +59,7 @@ class ScanResult:
 
     points_body: Array32  # (N, 3)
     normal: Normal | None
+    agrees: bool = True  # False: it came after a gap and does not fit the map; nothing was corrected
 
 
 class Lio:
@@ -65,6 +70,8 @@ class Lio:
         self.map = PointMap(config.map)
         self._map_error, self._track_error = MapError(), MapError()
         self._scan_s = start.t_s  # when the last sweep was used
+        self._back_s: float | None = None  # when sweeps came back after a gap
+        self._imu_doubt = ImuDoubt(config.imu_doubt)
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
         self._nodes = np.empty((0, NODE))
         self._thinner = Thinner()
@@ -77,12 +84,13 @@ class Lio:
         """Start from rate and specific force of a vehicle that stands still, (N, 6)."""
         return cls(start_filter(samples, config.start, t_s=0.0), config, rig, camera)
 
-    def predict(self, imu: Array) -> None:
-        """Advance through IMU pieces (N, 7): dt, rate, specific force."""
+    def predict(self, imu: Array, *, gap_s: float = 0.0) -> None:
+        """Advance through IMU pieces (N, 7): dt, rate, specific force; `gap_s`: the longest time between samples."""
         if len(imu):
             nodes = self.filter.predict(imu, self._densities)
             self._nodes = np.concatenate([self._nodes, nodes])[-_NODE_HISTORY:]
             self._standing.watch(imu, self.filter)
+            self._imu_doubt.gap(self.filter, gap_s)
 
     def update_lidar(self, points_sensor: Array32, age_s: Array32) -> ScanResult:
         """Take a sweep (N, 3) that ends now; `age_s` (N,) is now minus each point's time."""
@@ -97,10 +105,12 @@ class Lio:
             gate=self.config.gate,
         )
         normal = self._register(points_body) if self.map.voxels else None
+        if normal is None and self.map.voxels:
+            return ScanResult(points_body, None, agrees=False)
         spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
         if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):
             self._extend(spaced)
-            self._scan_s = self.filter.t_s
+            self._scan_s, self._back_s = self.filter.t_s, None
         return ScanResult(points_body, normal)
 
     @property
@@ -111,8 +121,8 @@ class Lio:
 
     @property
     def objection(self) -> str:
-        """Why the last image was not used; "": it was."""
-        return self._tracker.objection
+        """What is wrong with camera and IMU; "": nothing."""
+        return "; ".join(o for o in (self._tracker.objection, self._imu_doubt.reason(self.filter.t_s)) if o)
 
     def turn_directions(self, dirs_sensor: Array32, age_s: Array32) -> Array32:
         """Directions (N, 3) of a sweep that ends now -> the body frame of now."""
@@ -136,15 +146,44 @@ class Lio:
             self._track_error.extend(self.filter.state, self.filter.P, share)
         return normal
 
-    def _register(self, points_body: Array32) -> Normal:
-        before = self._pose()
+    def _register(self, points_body: Array32) -> Normal | None:
+        """What the sweep said; None: it came after a gap, does not fit the map, and corrected nothing."""
         self._take_back_track_error()
+        before, prior = self._pose(), (self.filter.state.copy(), self.filter.P)
         few = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
         scan = PlaneRegistration(self.map, few, self.config.plane)
-        normal = self.filter.update(scan.linearise, iterations=self.config.iterations, at_least=self.config.min_planes)
+        c = self.config
+        normal = self.filter.update(
+            scan.linearise, iterations=c.iterations, at_least=c.min_planes, begin=self._found(few)
+        )
+        if self._is_back() and not self._agrees(scan):
+            self.filter.state.x[:], self.filter.P = prior[0].x, prior[1]
+            return None
         move_nodes(self._nodes, before, self._pose())
         self._standing.seen(normal)
+        self._imu_doubt.corrected(self.filter)
         return normal
+
+    def _found(self, points_body: Array) -> tuple[Array, Array] | None:
+        """After a gap, where registration is to begin; None: where the filter is."""
+        if not self._is_back():
+            return None
+        P, state = self.filter.P, self.filter.state
+        sigma_m = float(np.sqrt(max(P[3, 3], P[4, 4])))
+        pose = (state.R.copy(), state.p.copy())
+        return search(self.map, points_body, pose, sigma_m=sigma_m, config=self.config.search)[:2]
+
+    def _is_back(self) -> bool:
+        """Whether sweeps came back after a gap, and none has been used since."""
+        return self.filter.t_s - self._scan_s > self.config.search.after_s
+
+    def _agrees(self, scan: PlaneRegistration) -> bool:
+        """Most of what meets the map must lie on it; after a while without, the map goes on from here."""
+        state, c = self.filter.state, self.config.search
+        self._back_s = self.filter.t_s if self._back_s is None else self._back_s
+        if self.filter.t_s - self._back_s > c.hold_s:
+            return True
+        return scan.fit_within(state.R, state.p, c.fits_m) > c.agree_share
 
     def _take_back_track_error(self) -> None:
         """What the camera's own map may have drifted, a sweep can mend: it is the filter's to correct."""

@@ -19,7 +19,7 @@ from companion.core.node import Node, Output, on
 from companion.core.rig import Rig
 from companion.core.topics import CAMERA, IMU, LIDAR, LIKELIHOOD, LIO_STATE, REGISTERED, WHY
 from companion.estimation.config import EstimationConfig
-from companion.estimation.imu_buffer import ImuBuffer
+from companion.estimation.imu_doubt import new_buffer
 from companion.estimation.lio import Lio, ScanResult
 from companion.estimation.ordering import Reorder
 from companion.estimation.registration import Normal
@@ -39,7 +39,7 @@ class LioNode(Node):
 
     def __init__(self, config: EstimationConfig, rig: Rig) -> None:
         self._config, self._rig = config, rig
-        self._imu = ImuBuffer()
+        self._imu = new_buffer(config.lio.imu_doubt)
         self._lio: Lio | None = None
         self._checked_ns = -(2**62)
         self._zero_ns = self._time_ns = 0
@@ -105,13 +105,14 @@ class LioNode(Node):
                 yield self._why("start again", "the filter's numbers are no longer finite")
 
     def _advance(self, lio: Lio, stamp_ns: int) -> None:
-        lio.predict(self._imu.between(self._time_ns, stamp_ns))
+        gap_s = self._imu.longest_gap_s(self._time_ns, stamp_ns)
+        lio.predict(self._imu.between(self._time_ns, stamp_ns), gap_s=gap_s)
         self._time_ns = stamp_ns
         lio.filter.t_s = (stamp_ns - self._zero_ns) * 1e-9  # no rounding adds up
 
     def _take_scan(self, lio: Lio, scan: LidarScan) -> Iterator[Output]:
         result = lio.update_lidar(scan.points_sensor, scan.point_age_s)
-        used = result.normal is None or result.normal.used >= self._config.lio.min_planes
+        used = result.normal is None or (result.agrees and result.normal.used >= self._config.lio.min_planes)
         if result.normal is not None and used:
             yield LIO_STATE(self._state(lio, "lidar", result.normal))
             yield LIKELIHOOD(self._likelihood("lidar", result.normal))
@@ -177,6 +178,8 @@ class LioNode(Node):
             trouble = "no return in range"
         elif result.normal is not None and result.normal.used < self._config.lio.min_planes:
             trouble = "hardly a point fits the map"
+        elif not result.agrees:
+            trouble = "after a gap, they do not agree with the map yet"
         if trouble != self._trouble:
             yield self._why("leave scans out" if trouble else "use scans again", trouble or "they fit the map")
         self._trouble = trouble

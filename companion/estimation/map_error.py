@@ -27,7 +27,7 @@ class MapErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     share: Annotated[float, msgspec.Meta(ge=0)] = (
         0.1  # of a pose's covariance, per map renewed: errors of sweeps average out
     )
-    track_share: Annotated[float, msgspec.Meta(ge=0)] = 1.0  # the same, of the camera's anchors
+    track_share: Annotated[float, msgspec.Meta(ge=0)] = 3.0  # the same, of the camera's anchors
 
 
 class MapError:

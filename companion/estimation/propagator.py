@@ -22,30 +22,33 @@ class Propagator:
     feels, and smoothing would give the velocity a lag.
     """
 
-    def __init__(self, config: PropagatorConfig, noise: ImuNoise) -> None:
+    def __init__(self, config: PropagatorConfig, noise: ImuNoise, imu: ImuBuffer) -> None:
         self._config, self._densities = config, noise.densities
-        self._imu = ImuBuffer()
+        self._imu = imu
         self._state: State | None = None
         self._P = np.empty((0, 0))
         self._time_ns = self._base_ns = self._scan_ns = 0
         self._scan_p = np.zeros(3)
         self._doubts = ""
-        self._starts = 0
+        self._resets = -1  # the first start is none
         self._published_ns = -(2**62)
 
     def correct(self, state: LioState) -> None:
         """Begin anew from a filter state and run through the IMU samples that came since."""
         if state.source == "start":
-            self._starts += 1
+            self._resets += 1
         elif self._state is None or state.stamp_ns < self._base_ns:
             return  # not started, or older than what is known
         if state.source != "camera":
             self._scan_ns, self._scan_p = state.stamp_ns, state.p_odom
         self._doubts = state.doubts
+        before = self._state.p.copy() if self._state is not None else state.p_odom
         self._state, self._P = _unpack(state), state.covariance.copy()
         self._time_ns = self._base_ns = state.stamp_ns
         if len(self._imu):
             self._run_to(self._imu.newest_ns)
+        if state.source != "start" and np.linalg.norm(self._state.p - before) > self._config.reset_from_m:
+            self._resets += 1
 
     def advance(self, sample: ImuSample) -> Odometry | None:
         """Take an IMU sample; the odometry at its stamp when one is due."""
@@ -81,7 +84,7 @@ class Propagator:
             velocity_variance=self._P.diagonal()[6:9].copy(),
             measured_ns=self._base_ns,
             quality=0.0 if blind else math.exp(-sigma_m / config.quality_sigma_m),
-            reset_counter=self._starts - 1,
+            reset_counter=self._resets,
             health=health,
             health_reason=reason,
         )

@@ -92,6 +92,22 @@ class PlaneRegistration:
         used = _linearise(self.points, R, p, self._planes, self._valid, limits, H, g)
         return Normal(R.copy(), p.copy(), H / c.inflation, g / c.inflation, used, len(self.points))
 
+    def share_within(self, R: Array, p: Array, distance_m: float) -> float:
+        """Share of all points that lie within a distance of their plane, searched anew at the pose."""
+        return float(self._within(R, p, distance_m).mean())
+
+    def fit_within(self, R: Array, p: Array, distance_m: float) -> float:
+        """The same, of the points that have a plane; 0 if fewer than one in twenty has one."""
+        within = self._within(R, p, distance_m)
+        return float(within.sum() / self._valid.sum()) if self._valid.mean() > 0.05 else 0.0
+
+    def _within(self, R: Array, p: Array, distance_m: float) -> Flags:
+        find_planes(self._map, self.points, R, p, self._config, self._planes, self._valid)
+        self._searched = (R.copy(), p.copy())
+        off = np.abs((self._planes[:, :3] * (self.points @ R.T + p)).sum(axis=1) + self._planes[:, 3])
+        within: Flags = self._valid & (off < distance_m)
+        return within
+
     def _is_stale(self, R: Array, p: Array) -> bool:
         if self._searched is None:
             return True

@@ -201,3 +201,10 @@ def test_a_node_that_is_down_holds_in_the_air_until_it_is_back():
     gone = m.NodeHealth(stamp_ns=flight.now_ns, node="GraphNode", alive=False, reason="killed")
     list(flight.node.handle(topics.HEALTH, gone))
     assert flight.run(1.0).action == "ok"  # nothing of the flight leans on the graph at once
+
+
+def test_lost_holds_and_then_lands_whatever_else_is_fine():
+    lost = dataclasses.replace(FINE, lost_because="position sigma 1.40 m", lost_s=0.1)
+    assert assess(lost, CONFIG).action == "hold"
+    assert "1.40 m" in assess(lost, CONFIG).reason
+    assert assess(dataclasses.replace(lost, lost_s=CONFIG.lost_land_s + 0.1), CONFIG).action == "land"
