@@ -50,7 +50,14 @@ class UnscentedFilter(Filter):
             self.P = P
         return said
 
-    def update(self, linearise: Linearise, *, iterations: int, at_least: int) -> Normal:
+    def update(
+        self,
+        linearise: Linearise,
+        *,
+        iterations: int,
+        at_least: int,
+        begin: tuple[Array, Array] | None = None,
+    ) -> Normal:
         """As `Filter.update`: the registration at each iterate, seen by the prior's sigma points.
 
         Normal equations at a pose are a linear measurement of the pose about it: with
@@ -59,6 +66,8 @@ class UnscentedFilter(Filter):
         prior = self.state.copy()
         points = spread(prior, self.P)
         errors = errors_about(points, prior)
+        if begin is not None:
+            self.state.R[:], self.state.p[:] = begin
         for _ in range(iterations):
             normal = linearise(self.state.R, self.state.p)
             if normal.used < at_least:
@@ -73,6 +82,8 @@ class UnscentedFilter(Filter):
             moved = self.state.minus(at)
             if np.linalg.norm(moved[:3]) < 1e-4 and np.linalg.norm(moved[3:6]) < 1e-3:
                 break
+        corrected = self.state.minus(prior)
+        self.surprise = float(corrected @ np.linalg.solve(self.P, corrected))
         self.P = P
         return normal
 
