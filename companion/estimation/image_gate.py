@@ -36,12 +36,12 @@ class ImageGate:
         self._last = pixels
         if same:
             return "camera frozen"  # noise makes every true image another one
-        if float(pixels.std()) < self._config.contrast:
+        if float(cv2.meanStdDev(pixels)[1][0, 0]) < self._config.contrast:
             return "camera dark"
         return self._blur(pixels)
 
     def _blur(self, pixels: Bytes2D) -> str:
-        sharpness = float(np.square(cv2.Laplacian(pixels, cv2.CV_32F)).mean())
+        sharpness = cv2.norm(cv2.Laplacian(pixels, cv2.CV_16S), cv2.NORM_L2SQR) / pixels.size
         blurred = sharpness < self._config.sharpness * self._usual
         share = self._config.doubt_share if blurred else self._config.usual_share
         self._usual = self._usual + share * (sharpness - self._usual) if self._usual else sharpness

@@ -19,7 +19,7 @@ from companion.core.rig import Rig
 from companion.estimation.camera import CameraConfig, CameraTracker
 from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
 from companion.estimation.downsample import Thinner
-from companion.estimation.filter import Filter
+from companion.estimation.filter import Filter, Linearise
 from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
 from companion.estimation.map_error import MapError, MapErrorConfig
 from companion.estimation.point_map import PointMap, PointMapConfig
@@ -46,9 +46,11 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     search: SearchConfig = SearchConfig()
     imu_doubt: ImuDoubtConfig = ImuDoubtConfig()
     weak_below: Annotated[float, msgspec.Meta(ge=0)] = 0.005  # normalised eigenvalue: such an axis is named
+    soften_below: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # the same, for what is left out without a camera
+    camera_out_s: Annotated[float, msgspec.Meta(gt=0)] = 0.3  # without an image that was of use
     lidar_out_s: Annotated[float, msgspec.Meta(gt=0)] = 0.25  # without a sweep: camera anchors drift
     thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # one point per voxel of this edge is registered
-    points: Count = 2000  # and at most so many
+    points: Count = 1500  # and at most so many
     iterations: Count = 5
     min_planes: Annotated[int, msgspec.Meta(ge=6)] = 20  # fewer: the scan is not used
 
@@ -70,6 +72,7 @@ class Lio:
         self.map = PointMap(config.map)
         self._map_error, self._track_error = MapError(), MapError()
         self._scan_s = start.t_s  # when the last sweep was used
+        self._image_s = -np.inf  # when the last image was of use
         self._back_s: float | None = None  # when sweeps came back after a gap
         self._imu_doubt = ImuDoubt(config.imu_doubt)
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
@@ -140,6 +143,7 @@ class Lio:
         before = self._pose()
         normal = self._tracker.update(pixels, self.filter, self.map, self.config.plane)
         move_nodes(self._nodes, before, self._pose())
+        self._image_s = self._image_s if normal is None else self.filter.t_s
         if self.filter.t_s - self._scan_s > self.config.lidar_out_s:
             self._track_error.move(self.filter.state.p)
             share = self._tracker.renewed * self.config.map_error.track_share
@@ -154,7 +158,7 @@ class Lio:
         scan = PlaneRegistration(self.map, few, self.config.plane)
         c = self.config
         normal = self.filter.update(
-            scan.linearise, iterations=c.iterations, at_least=c.min_planes, begin=self._found(few)
+            self._softened(scan), iterations=c.iterations, at_least=c.min_planes, begin=self._found(few)
         )
         if self._is_back() and not self._agrees(scan):
             self.filter.state.x[:], self.filter.P = prior[0].x, prior[1]
@@ -163,6 +167,12 @@ class Lio:
         self._standing.seen(normal)
         self._imu_doubt.corrected(self.filter)
         return normal
+
+    def _softened(self, scan: PlaneRegistration) -> Linearise:
+        """What the scan says; without a camera, less of it along axes in which it is blind."""
+        if self.filter.t_s - self._image_s < self.config.camera_out_s:
+            return scan.linearise
+        return lambda R, p: scan.linearise(R, p).softened(self.config.soften_below)
 
     def _found(self, points_body: Array) -> tuple[Array, Array] | None:
         """After a gap, where registration is to begin; None: where the filter is."""

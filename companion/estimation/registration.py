@@ -53,6 +53,21 @@ class Normal:
         scale = float(np.trace(self.H[3:, 3:]))
         return float(np.linalg.eigvalsh(_LEVER @ self.H @ _LEVER / scale)[0]) if scale > 0 else 0.0
 
+    def softened(self, below: float) -> Normal:
+        """Without what noise says along blind axes: w^4 / (w^4 + below^4) stays of an eigenvalue w of the scaled H.
+
+        Five noisy points of a plain make planes that lean at random, and their sum is no knowledge of the way along it.
+        """
+        scale = float(np.trace(self.H[3:, 3:]))
+        if scale <= 0 or below <= 0:
+            return self
+        values, vectors = np.linalg.eigh(_LEVER @ self.H @ _LEVER / scale)
+        kept = values**4 / (values**4 + below**4)
+        back = np.linalg.inv(_LEVER)
+        S = back @ (vectors * kept) @ vectors.T @ _LEVER
+        H = S @ self.H
+        return Normal(self.R, self.p, 0.5 * (H + H.T), S @ self.g, self.used, self.offered)
+
     def weak_axes(self, below: float) -> list[str]:
         """Names of the directions in which it says hardly anything, in odom: an axis, or a turn about one."""
         scale = float(np.trace(self.H[3:, 3:]))

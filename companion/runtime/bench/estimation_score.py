@@ -112,7 +112,14 @@ def nees_of(e: Estimates, true: Truth, biases: tuple[Array, Array] | None, *, fr
         off["accel_bias"] = (_between(e.stamps_ns, biases[0], biases[1][:, 3:]) - e.accel_bias, 12)
     parts = {k: normalised(error, e.covariance[:, i : i + 3, i : i + 3]) for k, (error, i) in off.items()}
     means = {k: float(np.mean(x[late])) for k, x in {**parts, "tilt": tilt, "yaw": yaw}.items()}
-    return Nees(**{"gyro_bias": None, "accel_bias": None, **means})
+    return Nees(
+        tilt=means["tilt"],
+        yaw=means["yaw"],
+        velocity=means["velocity"],
+        gyro_bias=means.get("gyro_bias"),
+        accel_bias=means.get("accel_bias"),
+        position=means["position"],
+    )
 
 
 def normalised(error: Array, covariance: Array) -> Array:
