@@ -127,6 +127,7 @@ def _planner_row(world: str, name: str, traces: Traces, best: list[float]) -> Pl
         figures[f"ratio_{ms:g}ms"] = float(np.median(_ratios_at(ms, runs, best)))
     near = _near_ms(runs, best)
     figures["near_share"] = float(np.mean(np.isfinite(near)))
+    figures["runs"] = float(len(runs))
     return _row(world, "near_p50_ms", planner=name, value=float(np.median(near)), figures=figures)
 
 
