@@ -69,3 +69,8 @@ class Authority:
         """The flight is over: whatever was asked before counts no more."""
         self._wanted, self._before, self._reached = "", "", False
         self._taken_ns, self.reason = None, ""
+
+
+def fulfilled(mode: str, *, armed: bool) -> list[str]:
+    """Kinds of commands that ask for what the vehicle already is."""
+    return ["arm" if armed else "disarm", *(kind for kind, of_kind in MODE_OF.items() if of_kind == mode)]

@@ -102,3 +102,9 @@ class CommandDesk:
             again.append(waiting.request._replace(confirmation=waiting.sent))
             waiting.ticks, waiting.sent = 0, waiting.sent + 1
         return again, ended
+
+
+def is_for(ack: object, system: int, component: int) -> bool:
+    """Whether an acknowledgement addresses us; zero addresses everyone, as old autopilots do."""
+    to_system, to_component = getattr(ack, "target_system", 0), getattr(ack, "target_component", 0)
+    return to_system in (0, system) and to_component in (0, component)

@@ -7,12 +7,14 @@ from dataclasses import replace
 from typing import Final
 
 from companion.autopilot import codec, modes, timesync
-from companion.autopilot.authority import MODE_OF, Authority
-from companion.autopilot.commands import CommandDesk, Verdict
+from companion.autopilot.authority import MODE_OF, Authority, fulfilled
+from companion.autopilot.commands import CommandDesk, Verdict, is_for
 from companion.autopilot.config import AutopilotConfig as AutopilotConfig  # for who builds the node
 from companion.autopilot.intervals import Intervals
+from companion.autopilot.key_words import WANTS_A_KEY, key_trouble, rejected_words
 from companion.autopilot.neighbours import Neighbours
 from companion.autopilot.outgoing import Target, odometry_message, setpoint_message
+from companion.autopilot.pace import OdometryPace
 from companion.autopilot.signing import Signing
 from companion.autopilot.texts import News, Newsroom, Severity, pieces
 from companion.autopilot.timesync import TimesyncFilter
@@ -48,8 +50,6 @@ _TIMESYNC: Final = 111
 _ONBOARD_CONTROLLER: Final = 18  # MAV_TYPE
 _ACTIVE: Final = 4  # MAV_STATE
 _REJECTED_EVERY_TICKS: Final = 100
-_WANTS_A_KEY: Final = "the autopilot signs its messages: it may want ours signed, with its key"
-_ANOTHER_KEY: Final = "frames come, but without a signature of our key: both sides need the same key file"
 _WANTED: Final = (*Id, _COMMAND_ACK, _TIMESYNC)
 
 
@@ -84,8 +84,7 @@ class AutopilotNode(Node):
         self._ticks = self._texts = self._rejected_told = 0
         self._barred = ""  # why setpoints do not go out
         self._reported: State | None = None
-        self._odometry_due_ns: int | None = None
-        self._odometry_resets = -1
+        self._pace = OdometryPace(config.odometry_hz)
 
     @on(MAVLINK_RX)
     def on_bytes(self, received: MavlinkBytes) -> Outputs:
@@ -111,7 +110,7 @@ class AutopilotNode(Node):
                 yield from self._start_anew(now_ns)
             self._timesync.learn(message, now_ns)
         elif frame.msg_id == _COMMAND_ACK:
-            if self._is_ours(message):
+            if is_for(message, self._config.system, self._config.component):
                 yield from self._results([self._desk.acknowledge(message)], now_ns)
         else:
             self._intervals.heard(frame.msg_id)
@@ -119,11 +118,6 @@ class AutopilotNode(Node):
                 yield from self._start_anew(now_ns)
             if frame.msg_id == Id.HEARTBEAT:
                 yield from self._watch_mode(now_ns)
-
-    def _is_ours(self, ack: object) -> bool:
-        """Zero addresses everyone, as old autopilots do."""
-        system, component = getattr(ack, "target_system", 0), getattr(ack, "target_component", 0)
-        return system in (0, self._config.system) and component in (0, self._config.component)
 
     def _start_anew(self, now_ns: int) -> Outputs:
         """The autopilot rebooted: nothing that it knew or we asked for holds any more."""
@@ -137,17 +131,13 @@ class AutopilotNode(Node):
     def _watch_mode(self, now_ns: int) -> Outputs:
         """What is done or taken from us must not be asked for again, though no answer came."""
         state = self._vehicle.state(now_ns)
-        for kind in self._fulfilled(state):
+        for kind in fulfilled(state.mode, armed=state.armed):
             yield from self._results([self._desk.fulfil(kind)], now_ns)
         if self._authority.saw(state.mode, armed=state.armed, now_ns=now_ns):
             reason = self._authority.reason
             yield from self._results(self._desk.cancel(reason), now_ns)
             yield self._why(now_ns, "command no more", reason)
             yield from self._tell(News(Severity.WARNING, f"{state.mode} is not ours, setpoints stop"), now_ns)
-
-    @staticmethod
-    def _fulfilled(state: State) -> list[str]:
-        return ["arm" if state.armed else "disarm", *(kind for kind, mode in MODE_OF.items() if mode == state.mode)]
 
     def _on_double(self, frame: Frame, now_ns: int) -> Outputs:
         if self._neighbours.heard(frame.sequence, now_ns):
@@ -192,7 +182,7 @@ class AutopilotNode(Node):
     @on(ODOMETRY)
     def on_odometry(self, odometry: Odometry) -> Outputs:
         """External pose for the autopilot's estimator, thinned out to `odometry_hz`."""
-        if not self._odometry_is_due(odometry):
+        if not self._pace.is_due(odometry):
             return
         stamp_ns: int | None = odometry.stamp_ns
         if self._config.odometry_clock == "autopilot":
@@ -202,18 +192,6 @@ class AutopilotNode(Node):
         message = odometry_message(odometry, stamp_ns=stamp_ns, rate_variance=self._config.rate_variance)
         if message is not None:
             yield self._send(message, odometry.stamp_ns)
-
-    def _odometry_is_due(self, odometry: Odometry) -> bool:
-        """By stamps, keeping the mean rate; a reset goes out at once."""
-        period_ns = round(1e9 / self._config.odometry_hz)
-        stamp_ns, due_ns = odometry.stamp_ns, self._odometry_due_ns
-        reset = odometry.reset_counter != self._odometry_resets
-        if due_ns is not None and not reset and due_ns - period_ns < stamp_ns < due_ns:
-            return False
-        late = due_ns is None or reset or abs(stamp_ns - due_ns) > period_ns
-        self._odometry_due_ns = (stamp_ns if late or due_ns is None else due_ns) + period_ns
-        self._odometry_resets = odometry.reset_counter
-        return True
 
     @on(VEHICLE_COMMAND)
     def on_command(self, command: VehicleCommand) -> Outputs:
@@ -267,7 +245,7 @@ class AutopilotNode(Node):
     def _explained(self, verdict: Verdict) -> Verdict:
         if self._signing is not None or not self._parser.signed:
             return verdict
-        return verdict._replace(reason=f"{verdict.reason}; {_WANTS_A_KEY}")
+        return verdict._replace(reason=f"{verdict.reason}; {WANTS_A_KEY}")
 
     def _interval_request(self, msg_id: int, hz: float) -> codec.CommandLong:
         system, component = self._target
@@ -292,9 +270,7 @@ class AutopilotNode(Node):
 
     def _key_trouble(self, *, ready: bool, connected: bool) -> str:
         """Why a vehicle that is there does not count, or does not hear us; '' if keys cannot be the reason."""
-        if self._signing is None:
-            return _WANTS_A_KEY if self._parser.signed and connected and not ready else ""
-        return _ANOTHER_KEY if self._signing.rejected.total and not connected else ""
+        return key_trouble(self._signing, signed=bool(self._parser.signed), ready=ready, connected=connected)
 
     def _tell(self, news: News | None, now_ns: int) -> Outputs:
         """A text to the pilot, if the autopilot is there to pass it on."""
@@ -307,10 +283,9 @@ class AutopilotNode(Node):
         """Frames that the key did not let pass, if there were more."""
         if self._signing is None or self._signing.rejected.total == self._rejected_told:
             return
-        r = self._signing.rejected
-        self._rejected_told = r.total
-        counts = f"{r.unsigned} unsigned, {r.forged} of another key or altered, {r.replayed} replayed or too old so far"
-        yield self._why(now_ns, "ignore frames without our signature", counts)
+        self._rejected_told = self._signing.rejected.total
+        words = rejected_words(self._signing.rejected)
+        yield self._why(now_ns, "ignore frames without our signature", words)
 
     def _why(self, now_ns: int, what: str, because: str) -> Output:
         return WHY(Why(stamp_ns=now_ns, node="autopilot", what=what, because=because))

@@ -23,7 +23,8 @@ from companion.runtime.bench.tracking_pilot import Course
 from companion.tracking.follow import Method
 
 T = TypeVar("T", bound=str)
-WORLD = "poisson,size_m=170,stems_per_ha=200,branches=4,slope_deg=0,roughness_m=0.02,start_m=45/85"
+COURSES = ("forest", "sparse", "slalom")
+WORLD = "poisson,size_m=170,stems_per_ha={},branches=4,slope_deg=0,roughness_m=0.02,start_m=45/85"
 GUSTS = ("sim.wind.mean_m_s=2.0", "sim.wind.heading_deg=60", "sim.wind.gust_m_s=1.0")
 _MISSION = "version: 1\nname: course\nsteps:\n  - {do: takeoff, alt: 3.0}\n  - {do: land}\n"  # the guards' fence: none
 COLUMNS = (
@@ -37,7 +38,10 @@ def tracking(
     methods: Annotated[
         list[str] | None, typer.Option("--method", help="This law; give it again for more. None: all.")
     ] = None,
-    course: Annotated[str, typer.Option(help="forest: the planner's way through one; slalom: in the open.")] = "forest",
+    course: Annotated[
+        str,
+        typer.Option(help="forest: the planner's way through 200 stems/ha; sparse: through 50; slalom: in the open."),
+    ] = "forest",
     estimate: Annotated[
         str, typer.Option(help="own: LiDAR and IMU in the loop; true: no estimator, 20 x faster.")
     ] = "own",
@@ -92,7 +96,8 @@ def course_simulator(
     course: str, estimate: Estimate, *, seed: int, overrides: list[str], console: Console
 ) -> AbstractContextManager[Simulator]:
     """The simulator with gusts; without rendering where the truth stands in for the estimators."""
-    world = WORLD if one_of(course, ("forest", "slalom"), "--course") == "forest" or estimate == "own" else "empty"
+    bare = one_of(course, COURSES, "--course") == "slalom" and estimate != "own"
+    world = "empty" if bare else WORLD.format(50 if course == "sparse" else 200)
     blind = [] if estimate == "own" else ["sim.render=false"]
     own = [o for o in overrides if o.startswith("sim.")]
     return open_simulator(world, seed, [*GUSTS, *blind, *own], 0, console)
@@ -102,7 +107,7 @@ def maker(course: str, sim: Simulator) -> Callable[[float], Course]:
     """From a speed limit to a course."""
     if course == "slalom":
         return lambda limit: slalom(top_m_s=limit)
-    return lambda limit: forest_course(sim.world.cones, top_m_s=limit, seed=sim.seed)
+    return lambda limit: forest_course(sim.world.cones, top_m_s=limit, seed=sim.seed, name=course)
 
 
 def course_mission() -> Mission:

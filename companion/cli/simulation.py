@@ -90,7 +90,8 @@ def open_simulator(
 
     A worker that is `most_waiting` requests behind leaves sweeps and frames out.
     """
-    config = apply_overrides_to(SimConfig(), [o.removeprefix("sim.") for o in overrides if o.startswith("sim.")])
+    own = [o.removeprefix("sim.") for o in overrides if o.startswith("sim.")]
+    config = apply_overrides_to(SimConfig(), own, root="sim")
     with console.status(f"building world {world}, seed {seed}"):
         built = load_world(world, seed=seed)
     renderer = _renderer(config, built, seed, workers=workers, most_waiting=most_waiting)

@@ -16,15 +16,15 @@ S = TypeVar("S", bound=msgspec.Struct)
 Tree = dict[str, Any]  # key -> Tree, or the text of a value
 
 
-def apply_overrides_to(struct: S, overrides: Sequence[str]) -> S:
-    """A copy of `struct` with `path.to.key=value` each applied; the last of equals wins.
+def apply_overrides_to(struct: S, overrides: Sequence[str], *, root: str = "") -> S:
+    """A copy of `struct` with `path.to.key=value` each applied; the last of equals wins. Errors name keys below `root`.
 
     Raises InputError with the path, the valid keys and a close match, or the type and range.
     """
     tree: Tree = {}
     for text in overrides:
         _plant(tree, text)
-    changed = _changed(struct, tree, ())
+    changed = _changed(struct, tree, (root,) if root else ())
     assert isinstance(changed, type(struct))
     return changed
 

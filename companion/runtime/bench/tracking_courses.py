@@ -34,7 +34,9 @@ def slalom(*, top_m_s: float, gates: int = 4, pitch_m: float = 12.0, swing_m: fl
     return paced("slalom", path, top_m_s=top_m_s)
 
 
-def forest_course(cones: Array, *, top_m_s: float, length_m: float = 70.0, seed: int = 1) -> Course:
+def forest_course(
+    cones: Array, *, top_m_s: float, length_m: float = 70.0, seed: int = 1, name: str = "forest"
+) -> Course:
     """The planner's way, smoothed, from above the origin `length_m` to the east past trunks and branches."""
     space = space_of(cones, (-4.0, -15.0), (length_m + 4.0, 15.0))
     start, goal = np.array([0.0, 0.0, HEIGHT_M]), np.array([length_m, 0.0, HEIGHT_M])
@@ -43,7 +45,7 @@ def forest_course(cones: Array, *, top_m_s: float, length_m: float = 70.0, seed:
     if not plan.solved:
         raise CompanionError("no way through this forest: try another --seed")
     path = smooth(plan.path, space, SmoothConfig())
-    return paced("forest", path, top_m_s=top_m_s, space=space)
+    return paced(name, path, top_m_s=top_m_s, space=space)
 
 
 def paced(name: str, path: Array, *, top_m_s: float, space: FieldSpace | None = None) -> Course:

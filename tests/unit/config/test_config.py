@@ -200,3 +200,8 @@ def test_dump_command_prints_yaml_or_json():
     assert load_config(result.stdout, file="c") == apply_overrides(Config(), ["mission.hold_s=5"])
     data = json.loads(CliRunner().invoke(app, ["--json"]).stdout)
     assert data["mission"]["hold_s"] == 20.0
+
+
+def test_an_error_names_the_key_as_it_was_typed():
+    with pytest.raises(InputError, match=r"sim\.ready_timeot_s"):
+        apply_overrides_to(MissionConfig(), ["ready_timeot_s=2"], root="sim")
