@@ -23,7 +23,8 @@ def planning_bench_page(rows: list[PlanningRow]) -> str:
 Printed by `companion bench planning`: CPU time of one core, the same exact check of edges for all, planners in turn.
 OMPL is the wheel `ompl` 2.0.1; it calls our check through Python, which costs it about two microseconds each time.
 Ratios are lengths over that of the shortest way known, medians over runs. Comparisons with OMPL are over the runs that
-all planners made, as few as `runs` says below. {rows[0].cores} cores with up to {load:g} runnable processes beside: times are longer than on a quiet machine, for all planners alike.
+all planners made, as few as `runs` says below. {rows[0].cores} cores with up to {load:g} runnable processes beside:
+times are longer than on a quiet machine, for all planners alike.
 
 ## Targets
 
