@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,7 @@ import typer
 from rich.console import Console
 
 from companion.cli.bus_options import say
-from companion.cli.place_scenes import Eye, Way, drifting_poses, true_poses, way_through
+from companion.cli.place_scenes import Eye, Way, drifting_poses, true_poses, way_length, way_through
 from companion.core.errors import InputError
 from companion.core.geometry import quaternion_from_yaw, rotation_from_quaternion
 from companion.core.messages import Array
@@ -22,6 +23,7 @@ from companion.estimation.places.locate import Locator
 from companion.estimation.places.loops import LoopConfig
 from companion.mapping.formats.stored_map import stored
 from companion.mapping.node import MappingConfig, MappingNode
+from companion.report.places_picture import draw_loops
 from companion.runtime.bench.places import PlaceRow, View, loop_rows, start_rows
 from companion.runtime.map_places import locator_of
 from sim.world import World, load_world
@@ -49,6 +51,15 @@ _LANES: list[list[float]] = [
 _BACK: list[list[float]] = [[0, 11], [0, 0]]
 _VIEWS, _SWEEPS, _SWEEP_STEP_M, _VIEW_STEP_M = 3, 5, 0.2, 1.0
 _MAP_NOISE_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    starts: int
+    pictures: Path | None
+
+
+Scene = Callable[[str, _Asked], list[PlaceRow]]
 _DRIFT = {"yaw_per_m": 3e-4, "scale": 1.003, "climb_per_m": 1.5e-3}
 
 
@@ -56,6 +67,7 @@ def places(
     scenes: Annotated[list[str] | None, typer.Option(help="This scene; give it again for more. None: all.")] = None,
     starts: Annotated[int, typer.Option(min=1, max=1000, help="Starts per map.")] = 100,
     out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
+    pictures: Annotated[Path | None, typer.Option(help="Folder for pictures of the loops.")] = None,
 ) -> None:
     """Measure how places are known again, as JSON lines. Example: companion bench places --scenes lost-mine --starts 20
 
@@ -65,24 +77,29 @@ def places(
     for name in scenes or ():
         if name not in _SCENES:
             raise InputError(f"{name!r} is no scene", field="--scenes", valid=", ".join(_SCENES))
-    if out is not None and not out.parent.is_dir():
-        raise InputError("no such folder", field="--out", file=str(out.parent))
+    for folder, name in ((out and out.parent, "--out"), (pictures, "--pictures")):
+        if folder is not None and not folder.is_dir():
+            raise InputError("no such folder", field=name, file=str(folder))
     rows: list[PlaceRow] = []
     for name in scenes or _SCENES:
         Console(stderr=True).print(name, style="dim", highlight=False)
-        for row in _SCENES[name](name, starts):
+        for row in _SCENES[name](name, _Asked(starts, pictures)):
             rows.append(row)
             say(msgspec.json.encode(row).decode())
     if out is not None:
         out.write_bytes(msgspec.json.Encoder().encode_lines(rows))
 
 
-def _loops(world: str, corners: Corners, agl_m: float) -> Callable[[str, int], list[PlaceRow]]:
-    def rows(name: str, _: int) -> list[PlaceRow]:
+def _loops(world: str, corners: Corners, agl_m: float) -> Scene:
+    def rows(name: str, asked: _Asked) -> list[PlaceRow]:
         built = load_world(world, seed=4)
         way = way_through(built, np.array(corners, np.float64), spacing_m=0.4, agl_m=agl_m)
         scans = Eye(built, seed=4).registered(way, drifting_poses(way, **_DRIFT, seed=4))
-        return loop_rows(name, scans, true_poses(way), LoopConfig())
+        figures, loops = loop_rows(name, scans, true_poses(way), LoopConfig())
+        if asked.pictures is not None:
+            title = f"{name}: {way_length(way):.0f} m, {len(loops.closures)} closures, with injected drift"
+            draw_loops(asked.pictures / f"loops-{name}.png", title, loops.ways, loops.closures, loops.seen)
+        return figures
 
     return rows
 
@@ -95,15 +112,17 @@ def _lost(
     *,
     seeds: tuple[int, int],
     target: float,
-) -> Callable[[str, int], list[PlaceRow]]:
+) -> Scene:
     """Starts in `visited` with the map of `mapped`; other seeds are other places."""
 
-    def rows(name: str, starts: int) -> list[PlaceRow]:
+    def rows(name: str, asked: _Asked) -> list[PlaceRow]:
         world = load_world(mapped, seed=seeds[0])
         way = way_through(world, np.array(corners, np.float64), spacing_m=1.0, agl_m=agl_m)
         locator = _mapped(world, way, agl_m)
         there = load_world(visited, seed=seeds[1])
-        return start_rows(name, locator, _starts(there, way, starts, agl_m), known=seeds[0] == seeds[1], target=target)
+        return start_rows(
+            name, locator, _starts(there, way, asked.starts, agl_m), known=seeds[0] == seeds[1], target=target
+        )
 
     return rows
 
@@ -141,7 +160,7 @@ def _view(eye: Eye, p_last: Array, yaw: float, counter: int, number: int) -> Vie
     return View(np.concatenate(seen), np.eye(3), step, p)
 
 
-_SCENES: dict[str, Callable[[str, int], list[PlaceRow]]] = {
+_SCENES: dict[str, Scene] = {
     "laps": _loops("poisson,stems_per_ha=250", _LAP * 4, 2.5),
     "rings": _loops("mine", _RINGS * 2, 1.6),
     "aisles": _loops("warehouse", (_AISLES + _BACK) * 2, 1.6),

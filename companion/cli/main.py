@@ -61,6 +61,7 @@ GROUPS = {  # group -> help, command -> module and function
             "convert": "map:convert",
             "slice": "map:slice_",
             "view": "map:view",
+            "locate": "map_locate:locate_flight",
             "roadmap": "map_route:roadmap",
             "route": "map_route:route",
         },

@@ -42,6 +42,11 @@ def _at(corners: Array, along: Array, s: Array) -> Array:
     return np.stack([np.interp(s, along, corners[:, k]) for k in range(2)], axis=1)
 
 
+def way_length(way: Way) -> float:
+    """In m."""
+    return float(np.linalg.norm(np.diff(way.p, axis=0), axis=1).sum())
+
+
 class Eye:
     """The LiDAR of the simulated vehicle, held still at each pose: sweeps need no motion compensation."""
 

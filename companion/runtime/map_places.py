@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from companion.core.messages import Array
@@ -11,7 +13,8 @@ from companion.mapping.formats.stored_map import StoredMap
 from companion.mapping.rays import BLOCK
 from companion.mapping.sensor_model import UNKNOWN
 
-_STEP_M = 0.6  # between places that are tried
+_STEP_M = 0.6  # between places that are tried, at least
+_MOST_EYES = 8000  # in larger maps they lie farther apart
 
 
 def locator_of(
@@ -30,7 +33,8 @@ def free_eyes(stored: StoredMap, height_m: float) -> Array:
     """Points (M, 3) of a level grid, `height_m` above ground, whose cells are known to be free."""
     ground = ground_height(stored)
     low = stored.block_xyz.min(axis=0).astype(np.int64) * BLOCK
-    step = max(round(_STEP_M / stored.resolution_m), 1)
+    apart_m = max(_STEP_M, stored.resolution_m * math.sqrt(ground.size / _MOST_EYES))
+    step = max(round(apart_m / stored.resolution_m), 1)
     i, j = (v.ravel() for v in np.meshgrid(*(np.arange(0, n, step) for n in ground.shape), indexing="ij"))
     z = ground[i, j] + height_m
     cell = np.stack([low[0] + i, low[1] + j, np.floor(z / stored.resolution_m).astype(np.int64)], axis=1)

@@ -114,9 +114,18 @@ class LoopFinder:
         return list(self._way)
 
     @property
-    def submap_keyframes(self) -> list[int]:
-        """The keyframe of each submap."""
-        return [submap.keyframe for submap in self._submaps]
+    def submaps(self) -> list[Submap]:
+        """All of them, in order."""
+        return list(self._submaps)
+
+    @property
+    def keyframe_p_odom(self) -> Array:
+        """Positions (K, 3) of the keyframes as odometry had them."""
+        return np.array(self._p).reshape(-1, 3)
+
+    def keyframe_R_odom(self, number: int) -> Array:
+        """Attitude (3, 3) of a keyframe as odometry had it."""
+        return self._R[number]
 
     def poses(self) -> Array:
         """Poses (K, 7) of the keyframes as corrected last, continued by odometry."""

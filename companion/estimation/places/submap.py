@@ -42,6 +42,7 @@ class CompareConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     trunks: TrunkConfig = TrunkConfig()
     constellation: ConstellationConfig = ConstellationConfig()
     verify: VerifyConfig = VerifyConfig()
+    reach_m: Positive = 13.0  # of the older one, that points of the newer must lie in to count: both saw it
     view: ViewConfig = ViewConfig()
     correlate: CorrelateConfig = CorrelateConfig()
     view_verify: VerifyConfig = VerifyConfig(near_m=0.2, least_near=0.85, settled_m=5e-3, iterations=20)
@@ -108,7 +109,9 @@ def _by_trunks(old: Submap, new: Submap, place: Place, expected: tuple[Array, fl
     if np.linalg.norm(place.p_map - expected[0][:2]) > expected[1]:
         return None
     guess = turn_z(place.yaw), np.array([*place.p_map, expected[0][2]])
-    aligned = align(old.cloud, new.cloud, guess, old.config.verify)
+    placed = new.cloud @ guess[0].T.astype(np.float32) + guess[1].astype(np.float32)
+    both = new.cloud[np.einsum("ij,ij->i", placed, placed) < old.config.reach_m**2]
+    aligned = align(old.cloud, both, guess, old.config.verify)
     return None if aligned is None else Match(aligned.R, aligned.p, place.inliers, aligned.near)
 
 

@@ -8,6 +8,7 @@ from time import thread_time
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.core.geometry import rotation_from_quaternion
 from companion.core.messages import Array, Array32, RegisteredScan
@@ -15,6 +16,7 @@ from companion.estimation.places.locate import Located, Locator, Search
 from companion.estimation.places.loops import Closure, LoopConfig, LoopFinder
 
 NEAR_M = 8.0  # pairs of submaps nearer than this are one place
+_SLICE_M = 0.5  # of the clouds about the height of flight, in a picture
 RIGHT_M, RIGHT_RAD = 0.2, 0.05  # a closure or an answer this near to the truth is right
 
 
@@ -38,9 +40,18 @@ class View:
     p_map: Array  # the truth, (3,)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Loops:
+    """What a picture needs: keyframes by odometry, corrected and true (K, 3), pairs of closures, clouds of submaps."""
+
+    ways: tuple[Array, Array, Array]
+    closures: NDArray[np.int64]  # (C, 2)
+    seen: tuple[Array, Array]  # (N, 3), where odometry and where the corrected poses put them
+
+
 def loop_rows(
     scene: str, scans: Iterable[RegisteredScan], truth: tuple[Sequence[Array], Array], config: LoopConfig
-) -> list[PlaceRow]:
+) -> tuple[list[PlaceRow], Loops]:
     """Feed scans with drifting poses; `truth` has R and p of each. Every pair is compared, whatever odometry says."""
     patient = msgspec.structs.replace(config, rest_m=0.0, most_closures=1000)
     finder, cpu_s, count = LoopFinder(patient), 0.0, 0
@@ -53,13 +64,14 @@ def loop_rows(
     right = (errors[:, 0] < RIGHT_M) & (errors[:, 1] < RIGHT_RAD)
     pairs = _pairs(finder, truth[1][at], patient)
     found = {(c.earlier, c.later) for c in finder.closures}
-    before = _ate(finder.poses()[:, :3], truth[1][at])
+    before = _ate(finder.keyframe_p_odom, truth[1][at])
     refused = finder.audit()
-    after = _ate(finder.corrected()[:, :3], truth[1][at])
+    corrected = finder.corrected()
+    after = _ate(corrected[:, :3], truth[1][at])
     precision = float(right.mean()) if len(right) else 1.0
     recall = len(pairs & found) / max(len(pairs), 1)
     way_m = float(np.linalg.norm(np.diff(truth[1], axis=0), axis=1).sum())
-    return [
+    rows = [
         PlaceRow(scene=scene, gauge="way_m", value=round(way_m, 1)),
         PlaceRow(scene=scene, gauge="closures", value=len(right)),
         PlaceRow(scene=scene, gauge="precision", value=round(precision, 4), target="1.000", met=precision == 1.0),
@@ -70,6 +82,23 @@ def loop_rows(
         PlaceRow(scene=scene, gauge="ate_after_m", value=round(after, 4), target="<= 0.05", met=after <= 0.05),
         PlaceRow(scene=scene, gauge="cpu_ms_per_s", value=round(1e4 * cpu_s / max(count, 1), 2)),
     ]
+    return rows, _loops(finder, corrected, truth[1][at])
+
+
+def _loops(finder: LoopFinder, corrected: Array, p_true: Array) -> Loops:
+    """With the corrected way in `map`, where the first keyframe stays."""
+    turn = finder.R_map_odom
+    way = corrected[:, :3] @ turn.T + finder.p_map_odom
+    odometry = finder.keyframe_p_odom
+    seen: tuple[list[Array], list[Array]] = ([], [])
+    for submap in finder.submaps:
+        k = submap.keyframe
+        cloud = submap.cloud[np.abs(submap.cloud[:, 2]) < _SLICE_M][::3]
+        R = turn @ rotation_from_quaternion(corrected[k, 3:]) @ finder.keyframe_R_odom(k).T
+        seen[0].append(cloud + odometry[k])
+        seen[1].append(cloud @ R.T + way[k])
+    pairs = np.array([(c.earlier, c.later) for c in finder.closures], np.int64).reshape(-1, 2)
+    return Loops((odometry, way, p_true), pairs, (np.concatenate(seen[0]), np.concatenate(seen[1])))
 
 
 def start_rows(
@@ -125,7 +154,7 @@ def _error(closure: Closure, at: Array, truth: tuple[Sequence[Array], Array]) ->
 def _pairs(finder: LoopFinder, p_true: Array, config: LoopConfig) -> set[tuple[int, int]]:
     """Pairs of submaps (keyframes earlier, later) that are one place, with way enough between them."""
     way = finder.way_m
-    frames = finder.submap_keyframes
+    frames = [submap.keyframe for submap in finder.submaps]
     return {
         (a, b)
         for n, b in enumerate(frames)

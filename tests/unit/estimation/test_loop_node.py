@@ -5,8 +5,9 @@ import pytest
 
 from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
 from companion.core.messages import LioState, MapFromOdom, PoseCorrections, RegisteredScan, Why
-from companion.core.topics import CORRECTIONS, LIO_STATE, REGISTERED
+from companion.core.topics import CORRECTIONS, LIO_STATE, MAP_FROM_ODOM, ODOMETRY, REGISTERED, SETPOINT, TRAJECTORY
 from companion.estimation.loop_node import LoopNode, LoopNodeConfig
+from companion.stack import NODES
 from tests.unit.estimation.test_loops import circle, drifting, forest, scans
 
 EMPTY = np.empty((0, 3), np.float32)
@@ -122,3 +123,11 @@ def test_switched_off_or_fed_nonsense_it_says_nothing(lap):
     assert run(node, [bad, lap[0][3], lap[0][0]]) == []
     assert node.finder.stamps_ns == [lap[0][3].stamp_ns]
     assert CORRECTIONS in LoopNode.publishes
+
+
+def test_only_maps_hear_of_loops_so_that_no_setpoint_can_step():
+    """Odometry, plans and setpoints come from nodes that know neither corrections nor `map_from_odom`."""
+    hearing = {n.__name__ for n in NODES if {CORRECTIONS, MAP_FROM_ODOM} & set(n.subscribes)}
+    moving = {n.__name__ for n in NODES if {ODOMETRY, LIO_STATE, REGISTERED, SETPOINT, TRAJECTORY} & set(n.publishes)}
+    assert hearing == {"MappingNode", "LandmarkNode"}
+    assert not hearing & moving
