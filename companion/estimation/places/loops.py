@@ -44,7 +44,8 @@ class LoopConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     least_way_m: Positive = 30.0  # flown between two submaps that may close a loop
     gate_m: Positive = 6.0  # distance by odometry of two submaps that are compared at most ...
     gate_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03  # ... plus this share of the way between
-    most_closures: Count = 2  # per submap, nearest first
+    most_compared: Count = 4  # earlier submaps per new one, nearest first, so that no scan waits long
+    most_closures: Count = 2  # per submap
     rest_m: Annotated[float, msgspec.Meta(ge=0)] = 25.0
     """After a closure that moves nothing odometry is right: so far is flown before places are compared again."""
     settled_m: Positive = 0.1  # a closure that disagrees less with the chain moves nothing
@@ -226,7 +227,7 @@ class LoopFinder:
             distance = float(np.linalg.norm(self._poses[old.keyframe][:3] - here))
             if between >= self.config.least_way_m and distance <= self._gate_m(between):
                 near.append((distance, old))
-        return [old for _, old in sorted(near, key=lambda pair: pair[0])]
+        return [old for _, old in sorted(near, key=lambda pair: pair[0])[: self.config.most_compared]]
 
     def _gate_m(self, between_m: float) -> float:
         return self.config.gate_m + self.config.gate_share * between_m

@@ -53,7 +53,7 @@ def loop_rows(
     scene: str, scans: Iterable[RegisteredScan], truth: tuple[Sequence[Array], Array], config: LoopConfig
 ) -> tuple[list[PlaceRow], Loops]:
     """Feed scans with drifting poses; `truth` has R and p of each. Every pair is compared, whatever odometry says."""
-    patient = msgspec.structs.replace(config, rest_m=0.0, most_closures=1000)
+    patient = msgspec.structs.replace(config, rest_m=0.0, most_compared=1000, most_closures=1000)
     finder, cpu_s, count = LoopFinder(patient), 0.0, 0
     for scan in scans:
         started = thread_time()
