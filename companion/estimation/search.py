@@ -68,7 +68,7 @@ def _fit(
         normal = scan.linearise(R, p)
         if normal.used < 6:
             return R, p, 0.0
-        step: Array = np.linalg.solve(normal.H + _DAMPING, normal.g)
+        step = np.asarray(np.linalg.solve(normal.H + _DAMPING, normal.g), np.float64)
         R, p = orthonormal(R @ exp_so3(step[:3])), p + step[3:]
         if np.linalg.norm(step[:3]) < 1e-3 and np.linalg.norm(step[3:]) < 1e-2:
             break
