@@ -277,11 +277,11 @@ class Limits:
 
 @message
 class Goal:
-    """Where to fly next. A new id replaces the old goal; kind `hold` stops in known-free space."""
+    """Where to fly next. A new id replaces the old; `hold` stops in known-free space, `land` over a free column."""
 
     stamp_ns: int
     id: int
-    kind: Literal["takeoff", "fly", "hold"]
+    kind: Literal["takeoff", "fly", "hold", "land"]
     p_odom: Array  # (3,)
     agl_m: float  # height above ground asked for; NaN: p_odom[2] holds
     radius_m: float  # reached within

@@ -35,7 +35,9 @@ class MissionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     settle_speed_m_s: Annotated[float, msgspec.Meta(gt=0)] = 0.3
     """Slower than this counts as stopped before landing."""
     settle_timeout_s: Seconds = 6.0
-    """Lands after this time even if it never stops."""
+    """Lands after this time even if it never stops ..."""
+    place_timeout_s: Seconds = 20.0
+    """... unless it is on the way to a place where the column below is known free: then after this time."""
     hold_s: Seconds = 20.0
     """on_fail hold: time for the pilot to take over before it lands."""
     land_timeout_s: Seconds = 90.0

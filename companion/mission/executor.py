@@ -7,71 +7,27 @@ Everything is bounded: each wait has a limit, each failure leads to a landing or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Literal
-
 import numpy as np
 from msgspec import UnsetType
 
-from companion.core.messages import Array, MissionStatus, Odometry, VehicleStatus, Why
-from companion.core.node import Output
-from companion.core.topics import GOAL, MISSION, VEHICLE_COMMAND, WHY
-from companion.mission.commands import Kind, Requests
+from companion.core.messages import Array
+from companion.core.topics import GOAL
+from companion.mission.commands import Kind
 from companion.mission.config import MissionConfig
-from companion.mission.estimate import estimate
 from companion.mission.inputs import Inputs, missing, taken_over
-from companion.mission.legs import Run, hold_goal
-from companion.mission.placing import Correction, Places
+from companion.mission.legs import Run
+from companion.mission.phases import Outputs, Phases
+from companion.mission.placing import Places
 from companion.mission.route import home_leg, legs_of
 from companion.mission.schema import Hover, Land, Mission, ReturnHome, Survey, Takeoff, set_or
 
-Outputs = Iterator[Output]
-State = Literal["waiting", "running", "failing", "done", "failed"]
 
-
-class Executor:
+class Executor(Phases):
     """Call `step` at 10 Hz with the newest inputs; publish what it yields, and `status`."""
 
     def __init__(self, mission: Mission, config: MissionConfig) -> None:
-        self._mission, self._config = mission, config
-        self._requests = Requests(
-            retry_ns=round(config.command_retry_s * 1e9),
-            answer_ns=round(config.command_answer_s * 1e9),
-            attempts=config.command_attempts,
-        )
-        self._timeouts_s = [
-            set_or(s.timeout_s, config.timeout_factor * row.time_s + config.timeout_extra_s)
-            for s, row in zip(mission.steps, estimate(mission), strict=True)
-        ]
-        self._phase: Callable[[int], Outputs] = self._wait
-        self._state: State = "waiting"
-        self._reason = ""
-        self._failure = ""
-        self._index = 0
-        self._since_ns: int | None = None  # of the phase
-        self._armed_ns = 0
-        self._retries = 0
-        self._goal_id = 0
-        self._home = np.zeros(3)
-        self._offboard_seen = self._land_seen = False
-        self._run: Run | None = None
-        self._in = Inputs()
-
-    @property
-    def requests(self) -> Requests:
-        """Commands under way; feed it COMMAND_RESULT."""
-        return self._requests
-
-    def status(self, now_ns: int) -> MissionStatus:
-        """Where the mission stands."""
-        return MissionStatus(
-            stamp_ns=now_ns,
-            step_id=self._mission.id_of(self._index),
-            step_index=self._index,
-            step_count=len(self._mission.steps),
-            state=self._state,
-            reason=self._failure or self._reason,
-        )
+        super().__init__(mission, config)
+        self._phase = self._wait
 
     def step(self, now_ns: int, inputs: Inputs) -> Outputs:
         """Decide once."""
@@ -132,7 +88,7 @@ class Executor:
 
     def _give_up(self, now_ns: int, reason: str) -> Outputs:
         """Stop the plan, so that a later return to OFFBOARD does not fly on by itself; command nothing."""
-        yield self._hold_goal(now_ns)
+        yield self._stop_goal(now_ns, "hold")
         yield from self._finish(now_ns, reason)
 
     def _guard(self, now_ns: int) -> Outputs:
@@ -161,11 +117,10 @@ class Executor:
         self._run = Run(legs, places, step, now_ns + round(self._timeouts_s[index] * 1e9))
         yield self._why(now_ns, f"step {self._mission.id_of(index)}", f"number {index + 1} is next")
         if isinstance(step, Land):
-            self._enter(self._settle, now_ns)
-            yield self._hold_goal(now_ns)
+            yield from self._descend(now_ns)
         elif isinstance(step, Hover):
             self._enter(self._hover, now_ns)
-            yield self._hold_goal(now_ns)
+            yield self._stop_goal(now_ns, "hold")
         else:
             self._enter(self._fly, now_ns)
             yield from self._send_leg(now_ns)
@@ -173,7 +128,7 @@ class Executor:
     def _next_step(self, now_ns: int) -> Outputs:
         step = self._mission.steps[self._index]
         if isinstance(step, ReturnHome) and step.land == "land":
-            self._enter(self._settle, now_ns)
+            yield from self._descend(now_ns)
         elif self._index + 1 < len(self._mission.steps):
             yield from self._begin(now_ns, self._index + 1)
         else:  # only after skipping the last step
@@ -211,7 +166,7 @@ class Executor:
         elif run.reached == 0:
             yield from self._fail(now_ns, "no goal could be reached")
         elif self._failure:
-            self._enter(self._settle, now_ns)
+            yield from self._descend(now_ns)
         else:
             yield from self._next_step(now_ns)
 
@@ -275,9 +230,11 @@ class Executor:
             yield from self._go_home(now_ns)
         elif action == "abort":
             self._enter(self._landing, now_ns)
+        elif action == "hold":
+            self._enter(self._hold, now_ns)
+            yield self._stop_goal(now_ns, "hold")
         else:
-            self._enter(self._hold if action == "hold" else self._settle, now_ns)
-            yield self._hold_goal(now_ns)
+            yield from self._descend(now_ns)
 
     def _land_now(self, now_ns: int, reason: str) -> Outputs:
         self._failure, self._state = self._failure or reason, "failing"
@@ -299,77 +256,6 @@ class Executor:
         if self._elapsed_s(now_ns) > self._config.hold_s:
             yield self._why(now_ns, "land here", f"no pilot within {self._config.hold_s:g} s")
             self._enter(self._landing, now_ns)
-
-    # --- down ------------------------------------------------------------------------
-
-    def _settle(self, now_ns: int) -> Outputs:
-        """Brake before landing."""
-        speed = float(np.linalg.norm(self._odometry.v_odom))
-        stopped = speed < self._config.settle_speed_m_s and self._elapsed_s(now_ns) > 0.5
-        if stopped or self._elapsed_s(now_ns) > self._config.settle_timeout_s:
-            yield self._why(now_ns, "land", f"at {speed:.2f} m/s")
-            self._enter(self._landing, now_ns)
-
-    def _landing(self, now_ns: int) -> Outputs:
-        vehicle = self._vehicle
-        if vehicle.landed and not vehicle.armed:
-            yield from self._finish(now_ns, self._failure)
-        elif vehicle.landed and self._elapsed_s(now_ns) > self._config.settle_timeout_s:
-            yield from self._ask("disarm", now_ns)
-        elif vehicle.mode != "LAND":
-            yield from self._ask("land", now_ns)
-            if self._requests.exhausted(now_ns):
-                why = self._requests.refusal or "no answer"
-                yield from self._finish(now_ns, f"the autopilot refuses to land: {why}")
-        if self._phase == self._landing and self._elapsed_s(now_ns) > self._config.land_timeout_s:
-            yield from self._finish(now_ns, f"not down after {self._config.land_timeout_s:g} s")
-
-    def _finish(self, now_ns: int, failure: str) -> Outputs:
-        self._failure = failure
-        self._state = "failed" if failure else "done"
-        yield self._why(now_ns, f"mission {self._state}", failure or "landed and disarmed")
-        self._enter(self._over, now_ns)
-        yield MISSION(self.status(now_ns))
-
-    def _over(self, now_ns: int) -> Outputs:
-        return iter(())
-
-    # --- helpers ---------------------------------------------------------------------
-
-    @property
-    def _correction(self) -> Correction:
-        return Correction.newest(self._in.smoothed)
-
-    @property
-    def _odometry(self) -> Odometry:
-        assert self._in.odometry is not None  # the start waited for it
-        return self._in.odometry
-
-    @property
-    def _vehicle(self) -> VehicleStatus:
-        assert self._in.vehicle is not None  # the start waited for it
-        return self._in.vehicle
-
-    def _enter(self, phase: Callable[[int], Outputs], now_ns: int) -> None:
-        self._phase, self._since_ns = phase, now_ns
-        self._requests.reset()
-
-    def _elapsed_s(self, now_ns: int) -> float:
-        assert self._since_ns is not None
-        return (now_ns - self._since_ns) * 1e-9
-
-    def _ask(self, kind: Kind, now_ns: int) -> Outputs:
-        command = self._requests.ask(kind, now_ns)
-        if command is not None:
-            yield VEHICLE_COMMAND(command)
-
-    def _hold_goal(self, now_ns: int) -> Output:
-        self._goal_id += 1
-        limits = self._mission.limits_of(self._mission.steps[self._index])
-        return GOAL(hold_goal(now_ns, self._goal_id, self._odometry.p_odom, limits))
-
-    def _why(self, now_ns: int, what: str, because: str) -> Output:
-        return WHY(Why(stamp_ns=now_ns, node="mission", what=what, because=because))
 
 
 def _shown(p: Array) -> str:

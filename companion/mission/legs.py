@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -76,12 +77,12 @@ class Run:
         return now_ns > self.deadline_ns
 
 
-def hold_goal(now_ns: int, goal_id: int, p_odom: Array, limits: Limits) -> Goal:
-    """Stop in known-free space."""
+def stop_goal(now_ns: int, goal_id: int, kind: Literal["hold", "land"], p_odom: Array, limits: Limits) -> Goal:
+    """Stop in known-free space; to land, above a column that is known free."""
     goal = Goal(
         stamp_ns=now_ns,
         id=goal_id,
-        kind="hold",
+        kind=kind,
         p_odom=p_odom.copy(),
         agl_m=float("nan"),
         radius_m=0.5,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatu
 from companion.core.node import Node, Outputs, every, on
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import Flown
+from companion.planning.landing import Columns, stopping_place
 from companion.planning.polyline import at, cut, length, project
 from companion.planning.replanner import Replanner, Situation
 from companion.planning.space import fill_ground
@@ -28,6 +30,8 @@ class PlanningNode(Node):
 
     def __init__(self, config: PlanningConfig, *, hull_radius_m: float, seed: int) -> None:
         self.config = config
+        self._hull_radius_m = hull_radius_m
+        self._no_place = ""  # why the vehicle should not land where it is; '' if nothing is against it
         self._replanner = Replanner(config, hull_radius_m=hull_radius_m, seed=seed)
         self._odometry: Odometry | None = None
         self._map: LocalMap | None = None
@@ -43,8 +47,24 @@ class PlanningNode(Node):
     @on(topics.GOAL)
     def take_goal(self, message: Goal) -> Outputs:
         """A new goal is planned for at once."""
-        self._replanner.take_goal(message)
+        self._no_place = ""
+        self._replanner.take_goal(self._above_a_place(message) if message.kind == "land" else message)
         yield from self._replan()
+
+    def _above_a_place(self, goal: Goal) -> Goal:
+        """To land: fly above the nearest place where the column is known free; if there is none, stop and say so."""
+        config, odometry, local_map = self.config.landing, self._odometry, self._map
+        if odometry is None or local_map is None:
+            self._no_place = "nothing is known of the column below: there is no local map"
+            return replace(goal, kind="hold")
+        stop = stopping_place(odometry.p_odom, odometry.v_odom, accel=goal.limits.accel)
+        radius_m = self._hull_radius_m + config.pad_m
+        columns = Columns(local_map, top_z_odom=float(stop[2]), radius_m=radius_m, config=config)
+        place = columns.nearest(stop)
+        if place is None:
+            self._no_place = f"no place to land within {config.within_m:g} m; below, {columns.fault(stop)}"
+            return replace(goal, kind="hold")
+        return replace(goal, kind="fly", p_odom=place, if_blocked="fail")
 
     @on(topics.LOCAL_MAP)
     def take_map(self, message: LocalMap) -> Outputs:
@@ -105,12 +125,12 @@ class PlanningNode(Node):
         return PlanStatus(
             stamp_ns=now_ns,
             goal_id=goal.id if goal is not None else -1,
-            state=replanner.state,
+            state="blocked" if self._no_place else replanner.state,
             distance_m=distance_m,
             plan_p_odom=ahead,
             cost_m=flown.reach_m if flown is not None else math.nan,
             iterations=replanner.iterations,
-            reason=replanner.reason if replanner.state == "blocked" else "",
+            reason=self._no_place or (replanner.reason if replanner.state == "blocked" else ""),
             checked=replanner.checked,
             refused=replanner.refused,
         )

@@ -30,7 +30,7 @@ def test_a_flight_is_offboard_arm_takeoff_steps_land():
     flight = FakeFlight(mission(GO))
     assert flight.until_over().state == "done"
     assert flight.commands == ["offboard", "arm", "land"]
-    assert [g.kind for g in flight.goals] == ["takeoff", "fly", "hold"]
+    assert [g.kind for g in flight.goals] == ["takeoff", "fly", "land"]
     np.testing.assert_allclose(flight.goals[0].p_odom, [0, 0, 2])
     np.testing.assert_allclose(flight.goals[1].p_odom, [8, 0, 2])
     assert not flight.armed and flight.landed
@@ -209,7 +209,7 @@ def test_no_progress_and_timeouts_end_a_step():
 def test_a_takeoff_that_stays_on_the_ground_gives_up_there():
     flight = FakeFlight(mission(GO), frozen=frozenset({1}))
     assert flight.until_over().state == "failed"
-    assert [g.kind for g in flight.goals] == ["takeoff", "hold"]
+    assert [g.kind for g in flight.goals] == ["takeoff", "land"]
     assert not flight.armed
 
 
@@ -256,7 +256,7 @@ def test_a_body_goal_outside_the_fence_is_refused_in_flight():
     flight = FakeFlight(text)
     assert flight.until_over().state == "failed"
     assert "11.0 m outside the fence" in flight.status.reason
-    assert [g.kind for g in flight.goals] == ["takeoff", "hold"]
+    assert [g.kind for g in flight.goals] == ["takeoff", "land"]
 
 
 def test_the_same_flight_says_the_same():
