@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, maximum_filter, minimum_filter
 
+from companion.core.geometry import rotation_from_quaternion
 from companion.core.messages import Array, LocalMap
 
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -28,6 +29,10 @@ class LandingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Share of unseen cells in the column, and of its ground, that is taken for chance."""
     ground_m: NotNegative = 0.5
     """What is occupied up to this height above the ground seen is ground."""
+    aside_m: NotNegative = 1.0
+    """So far aside it goes at least when the range finder sees what the map does not hold, up to ..."""
+    moves: Annotated[int, msgspec.Meta(ge=0)] = 3
+    """... so many times."""
     uneven_m: NotNegative = 0.6
     """Largest difference of the ground's heights under the column."""
 
@@ -64,16 +69,29 @@ class Columns:
             return "it lies outside the local map"
         return next((words for words, where in self._faults.items() if where[i, j]), "")
 
-    def nearest(self, p_odom: Array) -> Array | None:
-        """The place itself, or the nearest one without fault at its height, (3,) m; None: none within reach."""
-        if not self.fault(p_odom):
+    def nearest(self, p_odom: Array, *, beyond_m: float = 0.0) -> Array | None:
+        """The place itself, or the nearest one without fault at its height, (3,) m; None: none within reach.
+
+        Places nearer than `beyond_m` do not count.
+        """
+        if beyond_m <= 0.0 and not self.fault(p_odom):
             return p_odom.copy()
         good = np.argwhere(~np.logical_or.reduce(list(self._faults.values())))
         xy = self._map.origin_odom[:2] + (good + 0.5) * self._map.resolution_m
         away = np.linalg.norm(xy - p_odom[:2], axis=1)
+        xy, away = xy[away >= beyond_m], away[away >= beyond_m]
         if not away.size or away.min() > self._config.within_m:
             return None
         return np.append(xy[int(np.argmin(away))], p_odom[2])
+
+
+def beam_fault(range_m: float, q_odom_body: Array, height_m: float, config: LandingConfig) -> str:
+    """What a downward range finder (along body -z) sees above the ground of the map, `height_m` below; '' if nothing.
+
+    NaN (no echo, no ground) says nothing.
+    """
+    above_m = height_m - range_m * float(rotation_from_quaternion(q_odom_body)[2, 2])
+    return f"the range finder sees something {above_m:.1f} m above the ground" if above_m > config.ground_m else ""
 
 
 def stopping_place(p_odom: Array, v_odom: Array, *, accel: float) -> Array:

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from companion.core import topics
-from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, Trajectory, Why
+from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, RangeReading, Trajectory
 from companion.core.node import Node, Outputs, every, on
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import Flown
-from companion.planning.landing import Columns, stopping_place
+from companion.planning.landing import Columns, beam_fault, stopping_place
 from companion.planning.polyline import at, cut, length, project
 from companion.planning.replanner import Replanner, Situation
 from companion.planning.space import fill_ground
@@ -20,6 +20,7 @@ from companion.planning.target import ground_below
 from companion.planning.warm_up import warm_up
 
 _LOOK_M = 2.0  # a trajectory that ends sooner looks at the route this far ahead
+_RANGE_FRESH_NS = 300_000_000
 _STATUS_SPACING = 5  # every so manieth point of the route is shown
 
 
@@ -31,6 +32,9 @@ class PlanningNode(Node):
     def __init__(self, config: PlanningConfig, *, hull_radius_m: float, seed: int) -> None:
         self.config = config
         self._hull_radius_m = hull_radius_m
+        self._range: RangeReading | None = None
+        self._landing: Goal | None = None  # the goal of kind land that is flown
+        self._moves = 0  # places given up for it
         self._no_place = ""  # why the vehicle should not land where it is; '' if nothing is against it
         self._replanner = Replanner(config, hull_radius_m=hull_radius_m, seed=seed)
         self._odometry: Odometry | None = None
@@ -47,11 +51,18 @@ class PlanningNode(Node):
     @on(topics.GOAL)
     def take_goal(self, message: Goal) -> Outputs:
         """A new goal is planned for at once."""
-        self._no_place = ""
-        self._replanner.take_goal(self._above_a_place(message) if message.kind == "land" else message)
+        self._no_place, self._landing, self._moves = "", None, 0
+        if message.kind == "land":
+            self._landing, message = message, self._above_a_place(message)
+        self._replanner.take_goal(message)
         yield from self._replan()
 
-    def _above_a_place(self, goal: Goal) -> Goal:
+    @on(topics.RANGE)
+    def take_range(self, message: RangeReading) -> None:
+        """What is straight below."""
+        self._range = message
+
+    def _above_a_place(self, goal: Goal, *, beyond_m: float = 0.0) -> Goal:
         """To land: fly above the nearest place where the column is known free; if there is none, stop and say so."""
         config, odometry, local_map = self.config.landing, self._odometry, self._map
         if odometry is None or local_map is None:
@@ -60,11 +71,31 @@ class PlanningNode(Node):
         stop = stopping_place(odometry.p_odom, odometry.v_odom, accel=goal.limits.accel)
         radius_m = self._hull_radius_m + config.pad_m
         columns = Columns(local_map, top_z_odom=float(stop[2]), radius_m=radius_m, config=config)
-        place = columns.nearest(stop)
+        place = columns.nearest(stop, beyond_m=beyond_m)
         if place is None:
-            self._no_place = f"no place to land within {config.within_m:g} m; below, {columns.fault(stop)}"
+            below = columns.fault(stop) or self._seen_below(odometry, local_map)
+            self._no_place = f"no place to land within {config.within_m:g} m; below, {below}"
             return replace(goal, kind="hold")
         return replace(goal, kind="fly", p_odom=place, if_blocked="fail")
+
+    def _seen_below(self, odometry: Odometry, local_map: LocalMap) -> str:
+        """What the range finder sees that the map does not hold; '' if nothing, or if it is silent."""
+        fresh = self._range is not None and abs(odometry.stamp_ns - self._range.stamp_ns) < _RANGE_FRESH_NS
+        if self._range is None or not fresh:
+            return ""
+        ground_z = ground_below(local_map, odometry.p_odom, within_m=self._hull_radius_m, fallback_z=math.nan)
+        height_m = float(odometry.p_odom[2]) - ground_z
+        return beam_fault(self._range.range_m, odometry.q_odom_body, height_m, self.config.landing)
+
+    def _move_aside(self) -> None:
+        """Above the place to land, something stands in the range finder's beam: another place."""
+        landing, odometry, local_map = self._landing, self._odometry, self._map
+        if landing is None or odometry is None or local_map is None or not self._replanner.reached:
+            return
+        if self._no_place or self._moves >= self.config.landing.moves or not self._seen_below(odometry, local_map):
+            return
+        self._moves += 1
+        self._replanner.take_goal(self._above_a_place(landing, beyond_m=self.config.landing.aside_m))
 
     @on(topics.LOCAL_MAP)
     def take_map(self, message: LocalMap) -> Outputs:
@@ -82,6 +113,7 @@ class PlanningNode(Node):
         """Is the goal reached? Says so between replans."""
         if self._odometry is not None:
             self._replanner.look(self._odometry.p_odom, self._odometry.v_odom)
+        self._move_aside()
         yield topics.PLAN(self._status(now_ns))
 
     def _replan(self) -> Outputs:
@@ -96,6 +128,7 @@ class PlanningNode(Node):
             ground_z=self._ground_z,
         )
         flown = self._replanner.update(now)
+        self._move_aside()  # before anybody hears that it is reached
         yield topics.TRAJECTORY(self._trajectory(odometry, goal, flown))
         yield topics.PLAN(self._status(odometry.stamp_ns))
         for what, because in self._replanner.whys:

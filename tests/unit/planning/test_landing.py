@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from companion.planning.landing import Columns, LandingConfig, stopping_place
+from companion.core import topics
+from companion.core.messages import RangeReading
+from companion.planning.landing import Columns, LandingConfig, beam_fault, stopping_place
 
 CONFIG = LandingConfig()
 
@@ -82,6 +84,29 @@ def test_the_planner_flies_beside_a_stump_before_it_lands(flights, local_map):
     flight.run(2.0)
     assert np.linalg.norm(flight.vehicle.p[:2] - [8.1, 6.1]) > 0.8 and flight.speeds[-1] < 0.2
     assert Columns(flight._map(), top_z_odom=2.0, radius_m=0.35, config=CONFIG).fault(flight.vehicle.p) == ""
+
+
+def test_the_beam_says_what_the_map_does_not_hold():
+    level, leaning = np.array([1.0, 0.0, 0.0, 0.0]), np.array([np.cos(0.5), np.sin(0.5), 0.0, 0.0])
+    assert beam_fault(2.0, level, 2.1, CONFIG) == "" and beam_fault(2.0 / np.cos(1.0), leaning, 2.1, CONFIG) == ""
+    assert "1.1 m above the ground" in beam_fault(1.0, level, 2.1, CONFIG)
+    assert beam_fault(np.nan, level, 2.1, CONFIG) == "" == beam_fault(1.0, level, np.nan, CONFIG)
+
+
+def test_a_branch_that_only_the_range_finder_sees_is_avoided(flights, local_map):
+    occupied = np.zeros((160, 60, 20), bool)
+    occupied[:, :, 0] = True
+    start = np.array([8.1, 6.1, 2.0])
+    flight = flights.Flight(local_map, occupied, start, known=np.ones(occupied.shape, bool), gust=0.0)
+    flight.run(0.3)
+    flight.send(flights.goal_at(start, goal_id=5, kind="land"))
+    for _ in range(60):
+        near = np.linalg.norm(flight.vehicle.p[:2] - start[:2]) < 0.5
+        reading = RangeReading(stamp_ns=flight.now_ns, range_m=0.9 if near else float(flight.vehicle.p[2]) - 0.1)
+        list(flight.planning.handle(topics.RANGE, reading))
+        flight.run(0.1)
+    assert flight.status.state == "reached"
+    assert 0.7 < np.linalg.norm(flight.vehicle.p[:2] - start[:2]) < 2.0
 
 
 def test_without_a_place_the_planner_stops_and_says_why(flights, local_map):
