@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.core import topics
-from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, RangeReading, Trajectory
+from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, RangeReading, Trajectory, Why
 from companion.core.node import Node, Outputs, every, on
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import Flown
