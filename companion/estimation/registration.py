@@ -92,7 +92,7 @@ class PlaneRegistration:
     def __init__(self, target: PointMap, points_body: Array, config: PlaneConfig) -> None:
         self.points = points_body
         self._map, self._config = target, config
-        self._planes = np.empty((len(points_body), 4))
+        self._planes = np.zeros((len(points_body), 4))  # rows without a plane are multiplied, too
         self._valid = np.zeros(len(points_body), np.bool_)
         self._searched: tuple[Array, Array] | None = None
 
