@@ -14,7 +14,8 @@ from companion.planning.config import PlanningConfig
 from companion.planning.flown import Flown
 from companion.planning.landing import Columns, beam_fault, stopping_place
 from companion.planning.polyline import at, cut, length, project
-from companion.planning.replanner import Replanner, Situation
+from companion.planning.replanner import Replanner
+from companion.planning.situation import Situation
 from companion.planning.space import fill_ground
 from companion.planning.target import ground_below
 from companion.planning.warm_up import warm_up

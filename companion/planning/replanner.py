@@ -6,36 +6,26 @@ Always ends: failures are counted, and after a few the plan is `blocked` until a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from companion.core.messages import PROVEN, Array, Array32, Goal, LocalMap
+from companion.core.messages import PROVEN, Array, Goal
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import SLOW_M_S, Commitment, Flown, braked, clear_m, commit, with_speeds
 from companion.planning.polyline import cut, length, project, resample, without_repeats
 from companion.planning.registry import make_planner
 from companion.planning.route import Route, RouteFinder, Spaces
+from companion.planning.situation import Situation
 from companion.planning.smooth import smooth
 from companion.planning.space import FieldSpace
 from companion.planning.standing import Standing
-from companion.planning.switch import better
+from companion.planning.switch import as_flown, better
 from companion.planning.target import at_height
 from companion.planning.verify import first_hit_m
 
 State = Literal["idle", "flying", "reached", "blocked"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Situation:
-    """Where the vehicle is and what is known around it."""
-
-    p_odom: Array
-    v_odom: Array
-    local_map: LocalMap
-    ground: Array32 | None  # filled, (X, Y)
-    ground_z: float  # last seen under the vehicle
 
 
 class Replanner:
@@ -117,8 +107,7 @@ class Replanner:
         fly = {"takeoff": self._take_off, "fly": self._fly, "hold": self._hold}[self.goal.kind]
         self.flown = self._checked(fly(self.goal, now), now)
         self._begun = True
-        due = None if self.reached or first else self.flown
-        self._standing.count(due, self.goal, now.local_map, p_odom=now.p_odom, v_odom=now.v_odom)
+        self._standing.count(None if self.reached or first else self.flown, self.goal, now)
         return self.flown
 
     def _checked(self, flown: Flown, now: Situation) -> Flown:
@@ -225,9 +214,12 @@ class Replanner:
         return np.vstack([old, route.target]) if near else None
 
     def _switches(self, route: Route, old: Array, space: FieldSpace) -> bool:
-        """Does the route replace a good old way? One around the other side of something only if it is far better."""
-        new = without_repeats(np.vstack([route.escape, route.path]))
-        replaces, same = better(new, old, space, self.config.switch)
+        """Does the route replace a good old way? Also as it would be flown: no raw way is as long as a smooth one."""
+        config = self.config
+        if not better(without_repeats(np.vstack([route.escape, route.path])), old, space, config.switch)[0]:
+            return False
+        new = as_flown(route.escape, route.path, route.space, config.smooth)
+        replaces, same = better(new, old, space, config.switch)
         if replaces and not same:
             self.whys.append(("another way", f"{length(new):.1f} m instead of {length(old):.1f} m"))
         return replaces

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.core.messages import Array, Goal, LocalMap
+from companion.core.messages import Goal
 from companion.planning.flown import SLOW_M_S, Flown
 from companion.planning.polyline import length, project
+from companion.planning.situation import Situation
 from companion.planning.speed_profile import SpeedConfig, known_free_m, spacing_of
 
 _WAY_LEFT_M = 0.3  # a way that stops sooner counts as standing
@@ -25,27 +26,27 @@ class Standing:
         """Has it stood for long?"""
         return self.still >= self._creep_after
 
-    def count(self, flown: Flown | None, goal: Goal, local_map: LocalMap, *, p_odom: Array, v_odom: Array) -> None:
+    def count(self, flown: Flown | None, goal: Goal, now: Situation) -> None:
         """A replan with the answer `flown`; None: there is nothing to fly."""
         if flown is None:
             self.still = 0
             return
-        moves = float(np.linalg.norm(v_odom)) >= SLOW_M_S
+        moves = float(np.linalg.norm(now.v_odom)) >= SLOW_M_S
         if moves and not self.creeps:
             self.still = 0
         elif not moves:
             points, _ = flown.ahead_until_stop
-            s, _ = project(points, p_odom)
+            s, _ = project(points, now.p_odom)
             self.still = self.still + 1 if length(points) - s < _WAY_LEFT_M else self.still
-        elif self._known_ahead_m(flown, goal, local_map, p_odom) > _KNOWN_M:
+        elif self._known_ahead_m(flown, goal, now) > _KNOWN_M:
             self.still = 0
 
-    def _known_ahead_m(self, flown: Flown, goal: Goal, local_map: LocalMap, p_odom: Array) -> float:
+    def _known_ahead_m(self, flown: Flown, goal: Goal, now: Situation) -> float:
         """Way ahead that is known free with all the clearance asked for: then creeping may end."""
         if len(flown.points) < 2:
             return 0.0
-        s = project(flown.points, p_odom)[0]
+        s = project(flown.points, now.p_odom)[0]
         first = min(int(s / spacing_of(flown.points)), len(flown.points) - 1)
         ahead = flown.points[first:]
         radii_m = (self._hull_radius_m + goal.limits.clearance, self._hull_radius_m)
-        return min(known_free_m(ahead, local_map, self._config, radii_m), length(ahead))
+        return min(known_free_m(ahead, now.local_map, self._config, radii_m), length(ahead))

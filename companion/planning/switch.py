@@ -1,7 +1,8 @@
 """When a new way replaces the one being flown: nearly at once if it bends the same way around everything, late if not.
 
 Two ways are taken to be of one homotopy class if all straight lines between points at the same shares of their lengths
-are free: the one can then be drawn into the other (sufficient, not necessary).
+are free: the one can then be drawn into the other (sufficient, not necessary). Lengths are compared as flown: smoothing
+makes ways longer, so a raw way around the same trunks seems shorter than the smooth old one at every replan.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import msgspec
 import numpy as np
 
 from companion.core.messages import Array
-from companion.planning.polyline import at, length
+from companion.planning.polyline import at, length, without_repeats
+from companion.planning.smooth import SmoothConfig, smooth
 from companion.planning.space import FieldSpace
 
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
@@ -39,6 +41,11 @@ def same_class(a: Array, b: Array, space: FieldSpace) -> bool:
     shares = np.linspace(0.0, 1.0, rungs + 1)
     pairs = zip(at(a, shares * length(a)), at(b, shares * length(b)), strict=True)
     return all(space.segment_free(p, q) for p, q in pairs)
+
+
+def as_flown(escape: Array, path: Array, space: FieldSpace, config: SmoothConfig) -> Array:
+    """A raw way, `path` (N, 3) free in `space` behind its `escape` (M, 3), with the length that it has smoothed."""
+    return without_repeats(np.vstack([escape, smooth(without_repeats(path), space, config)]))
 
 
 def better(new: Array, old: Array, space: FieldSpace, config: SwitchConfig) -> tuple[bool, bool]:
