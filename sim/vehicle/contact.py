@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from companion.core.errors import InputError
 from companion.core.messages import Array
-from sim.world.reach import ConeGrid, grid_of
+from sim.world.columns import Columns, items_near
+from sim.world.reach import sort_cones
 from sim.world.terrain import _height
 from sim.world.walkers import NOBODY, Walkers, feet_of
 from sim.world.walls import NO_WALLS, Walls, point_to_triangle
@@ -83,8 +84,8 @@ class Near:
         count = len(obstacles.cones)
         self.cones: Array = np.ascontiguousarray(obstacles.cones, dtype=np.float64)
         self.kinds = np.ascontiguousarray(obstacles.kinds, dtype=np.int8)
-        self.grid: ConeGrid = grid_of(self.cones)
-        self.frame: Array = np.array([*self.grid.origin_xy, *self.grid.shape, np.nan, np.nan, np.nan])
+        self.grid: Columns = sort_cones(self.cones)
+        self.frame: Array = np.array([*self.grid.frame, np.nan, np.nan, np.nan])
         self.list: NDArray[np.int64] = np.zeros(count + 1, np.int64)  # [0]: how many
         self.seen: NDArray[np.int64] = np.zeros(count + 1, np.int64)  # [-1]: number of the search
 
@@ -188,51 +189,25 @@ def _gather_walls(x, walls, center, near, seen, reach):  # type: ignore[no-untyp
     """Fill `near` with the walls within reach of the body's origin."""
     balls, frame, start, items = walls
     center[0], center[1], center[2] = x[0], x[1], x[2]
-    seen[-1] += 1
     near[0] = 0
-    nx, ny = int(frame[2]), int(frame[3])
-    i0, i1 = max(math.floor(x[0] - reach - frame[0]), 0), min(math.floor(x[0] + reach - frame[0]), nx - 1)
-    j0, j1 = max(math.floor(x[1] - reach - frame[1]), 0), min(math.floor(x[1] + reach - frame[1]), ny - 1)
-    if j1 < j0:
-        return
-    for i in range(i0, i1 + 1):
-        for k in range(start[i * ny + j0], start[i * ny + j1 + 1]):
-            t = items[k]
-            if seen[t] == seen[-1]:
-                continue
-            seen[t] = seen[-1]
-            bx, by, bz = balls[t, 0] - x[0], balls[t, 1] - x[1], balls[t, 2] - x[2]
-            if math.sqrt(bx * bx + by * by + bz * bz) - balls[t, 3] < reach:
-                near[0] += 1
-                near[near[0]] = t
+    for n in range(1, 1 + items_near(frame, start, items, x, reach, seen, near[1:])):
+        t = near[n]
+        bx, by, bz = balls[t, 0] - x[0], balls[t, 1] - x[1], balls[t, 2] - x[2]
+        if math.sqrt(bx * bx + by * by + bz * bz) - balls[t, 3] < reach:
+            near[0] += 1
+            near[near[0]] = t
 
 
 @njit(cache=True, nogil=True)
 def _gather(x, cones, frame, start, items, near, seen, reach):  # type: ignore[no-untyped-def]
     """Fill `near` with the cones within reach of the body's origin."""
     frame[4], frame[5], frame[6] = x[0], x[1], x[2]
-    seen[-1] += 1
     near[0] = 0
-    nx, ny = int(frame[2]), int(frame[3])
-    i0, i1 = (
-        max(math.floor(x[0] - reach - frame[0]), 0),
-        min(math.floor(x[0] + reach - frame[0]), nx - 1),
-    )
-    j0, j1 = (
-        max(math.floor(x[1] - reach - frame[1]), 0),
-        min(math.floor(x[1] + reach - frame[1]), ny - 1),
-    )
-    if j1 < j0:
-        return
-    for i in range(i0, i1 + 1):
-        for k in range(start[i * ny + j0], start[i * ny + j1 + 1]):
-            c = items[k]
-            if seen[c] == seen[-1]:
-                continue
-            seen[c] = seen[-1]
-            if _axis_distance(cones[c], x[0], x[1], x[2]) - max(cones[c, 7], cones[c, 8]) < reach:
-                near[0] += 1
-                near[near[0]] = c
+    for n in range(1, 1 + items_near(frame, start, items, x, reach, seen, near[1:])):
+        c = near[n]
+        if _axis_distance(cones[c], x[0], x[1], x[2]) - max(cones[c, 7], cones[c, 8]) < reach:
+            near[0] += 1
+            near[near[0]] = c
 
 
 @njit(cache=True, nogil=True)

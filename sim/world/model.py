@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.messages import Array
+from sim.world.columns import Columns
 from sim.world.mesh import Mesh
-from sim.world.reach import ConeGrid, first_hit
+from sim.world.reach import first_hit
 from sim.world.terrain import heights_at
 from sim.world.walkers import NOBODY, Walkers
 from sim.world.walls import NO_WALLS, Walls
@@ -58,7 +59,7 @@ class World:
     origin_xy: Array  # (2,)
     cell_m: float
     mesh: Mesh
-    grid: ConeGrid  # which cones touch which square metre
+    grid: Columns  # which cones touch which square metre
     walkers: Walkers = NOBODY  # what moves; everything else stands still
     walls: Walls = NO_WALLS  # racks, halls, rock
     air: Air = CLEAR

@@ -1,7 +1,6 @@
 """Whatever is neither ground nor tree: racks, halls, rock, as triangles that are hit and touched.
 
-Triangles are sorted into columns of 1 m by their boxes in x and y, as the cones are. Distance of
-a point to a triangle: C. Ericson, "Real-Time Collision Detection", 2005, sec. 5.1.5; a ray:
+Distance of a point to a triangle: C. Ericson, "Real-Time Collision Detection", 2005, sec. 5.1.5; a ray:
 T. Moeller and B. Trumbore, "Fast, Minimum Storage Ray/Triangle Intersection", 1997.
 """
 
@@ -15,15 +14,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.core.messages import Array
+from sim.world.columns import columns_crossed, sort_into_columns
 
-_CELL_M = 1.0
 _FREE_M = 1e-9  # a ray that starts on a wall leaves it
 Tables = tuple[Array, Array, Array, NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """Triangles (T, 3, 3), m, world; each with the ball about its middle; those of cell (i, j) as in ConeGrid."""
+    """Triangles (T, 3, 3), m, world; each with the ball about its middle; those of cell (i, j) as in `Columns`."""
 
     corners: Array
     balls: Array  # (T, 4), middle and radius
@@ -52,23 +51,10 @@ class Walls:
 def make_walls(corners: Array) -> Walls:
     """Sort triangles (T, 3, 3) into columns."""
     corners = np.ascontiguousarray(corners, np.float64).reshape(-1, 3, 3)
-    if not len(corners):
-        nothing = np.zeros(0, np.int64)
-        return Walls(corners, np.zeros((0, 4)), np.array([0.0, 0.0, 1.0, 1.0]), np.zeros(2, np.int64), nothing)
     middle = corners.mean(axis=1)
     radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-    low, high = corners[..., :2].min(axis=1), corners[..., :2].max(axis=1)
-    origin = np.floor(low.min(axis=0))
-    first = ((low - origin) / _CELL_M).astype(np.int64)
-    span = ((high - origin) / _CELL_M).astype(np.int64) - first + 1
-    shape = (first + span).max(axis=0)
-    count = span[:, 0] * span[:, 1]
-    item = np.repeat(np.arange(len(corners)), count)
-    k = np.arange(len(item)) - np.repeat(np.cumsum(count) - count, count)
-    cell = (first[item, 0] + k // span[item, 1]) * shape[1] + first[item, 1] + k % span[item, 1]
-    start = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=int(shape[0] * shape[1])))])
-    frame = np.array([*origin, *shape], np.float64)
-    return Walls(corners, np.column_stack([middle, radius]), frame, start, item[np.argsort(cell, kind="stable")])
+    columns = sort_into_columns(corners[..., :2].min(axis=1), corners[..., :2].max(axis=1))
+    return Walls(corners, np.column_stack([middle, radius]), columns.frame, columns.start, columns.items)
 
 
 NO_WALLS = make_walls(np.zeros((0, 3, 3)))
@@ -76,28 +62,13 @@ NO_WALLS = make_walls(np.zeros((0, 3, 3)))
 
 @njit(cache=True, nogil=True)
 def _first_hit(corners, frame, start, items, p, d, reach):  # type: ignore[no-untyped-def]
-    """Walk the columns that the ray crosses (Amanatides and Woo, 1987)."""
-    x, y = p[0] - frame[0], p[1] - frame[1]
-    nx, ny = int(frame[2]), int(frame[3])
-    i, j = math.floor(x), math.floor(y)
-    si, sj = 1 if d[0] > 0 else -1, 1 if d[1] > 0 else -1
-    dt_x = 1.0 / abs(d[0]) if d[0] != 0.0 else np.inf
-    dt_y = 1.0 / abs(d[1]) if d[1] != 0.0 else np.inf
-    next_x = (i + (si > 0) - x) / d[0] if d[0] != 0.0 else np.inf
-    next_y = (j + (sj > 0) - y) / d[1] if d[1] != 0.0 else np.inf
-    best, t = reach, 0.0
-    while t < best:
-        if 0 <= i < nx and 0 <= j < ny:
-            k = i * ny + j
-            for q in range(start[k], start[k + 1]):
-                best = min(best, _ray(corners[items[q]], p, d))
-        t = min(next_x, next_y)
-        if next_x < next_y:
-            next_x += dt_x
-            i += si
-        else:
-            next_y += dt_y
-            j += sj
+    columns, entered = columns_crossed(frame, p, d, reach)
+    best = reach
+    for n in range(columns.size):
+        if entered[n] >= best:
+            break
+        for q in range(start[columns[n]], start[columns[n] + 1]):
+            best = min(best, _ray(corners[items[q]], p, d))
     return best
 
 

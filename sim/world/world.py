@@ -14,7 +14,7 @@ from sim.world import stand
 from sim.world.mesh import BRANCH, TRUNK, Mesh, assemble, ground_mesh, leaf_mesh, some_triangles, tube_mesh, wall_mesh
 from sim.world.mine import junctions, mine_triangles, tunnels
 from sim.world.model import BRANCH_CONE, TRUNK_CONE, Air, Stems, World
-from sim.world.reach import grid_of
+from sim.world.reach import sort_cones
 from sim.world.spec import (
     EmptySpec,
     MineSpec,
@@ -122,7 +122,7 @@ def build_world(spec: WorldSpec, *, name: str, seed: int) -> World:
             origin_xy=origin,
             cell_m=spec.cell_m,
             mesh=assemble(parts),
-            grid=grid_of(cones),
+            grid=sort_cones(cones),
             walkers=walkers,
             walls=make_walls(walls),
             air=Air(spec.light, spec.dust, spec.lidar_loss),
