@@ -165,12 +165,7 @@ def _to_faces(todo, front, later, waits, queue, next_queue, count):  # type: ign
                 spread_to = word if n > 0 else word << one | word >> one | below | above
                 new = spread_to & todo[a, b, w]
                 if new != 0:
-                    todo[a, b, w] ^= new
-                    later[a, b, w] |= new
-                    if not waits[a, b]:
-                        waits[a, b] = True
-                        next_queue[more, 0], next_queue[more, 1] = a, b
-                        more += 1
+                    more = _reach(todo, later, waits, next_queue, more, (a, b, w), new)
     _wipe(front, queue, count)
     return more
 
@@ -197,14 +192,22 @@ def _to_all(free, todo, front, later, waits, queue, next_queue, count):  # type:
                         there |= (above & free[a, b, w + 1]) << top
                     new = there & todo[a, b, w]
                     if new != 0:
-                        todo[a, b, w] ^= new
-                        later[a, b, w] |= new
-                        if not waits[a, b]:
-                            waits[a, b] = True
-                            next_queue[more, 0], next_queue[more, 1] = a, b
-                            more += 1
+                        more = _reach(todo, later, waits, next_queue, more, (a, b, w), new)
     _wipe(front, queue, count)
     return more
+
+
+@njit(cache=True, nogil=True)
+def _reach(todo, later, waits, next_queue, more, word, new):  # type: ignore[no-untyped-def]
+    """Blocks `new` of a word are reached; its column queues once. Returns the length of the queue."""
+    a, b, w = word
+    todo[a, b, w] ^= new
+    later[a, b, w] |= new
+    if waits[a, b]:
+        return more
+    waits[a, b] = True
+    next_queue[more, 0], next_queue[more, 1] = a, b
+    return more + 1
 
 
 @njit(cache=True, nogil=True)
