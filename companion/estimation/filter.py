@@ -60,7 +60,7 @@ class Filter:
             right[:6] += normal.g
             step = np.linalg.solve(posterior, right)
             self.state.retract(step)
-            if _is_small(step):
+            if is_small(step):
                 break
         moved = self.state.minus(prior)
         self.surprise = float(moved @ information @ moved)
@@ -114,5 +114,6 @@ class StartSigmas:
     vertical_bias_m_s2: float = 2e-2
 
 
-def _is_small(step: Array) -> bool:
+def is_small(step: Array) -> bool:
+    """Whether a correction (6+,), rad and m first, ends the iteration."""
     return bool(np.linalg.norm(step[:3]) < 1e-4 and np.linalg.norm(step[3:6]) < 1e-3)

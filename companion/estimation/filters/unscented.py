@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from companion.core.messages import Array
-from companion.estimation.filter import Filter, Linearise
+from companion.estimation.filter import Filter, Linearise, is_small
 from companion.estimation.filters.kalman import Innovation
 from companion.estimation.filters.measurements import Measurement
 from companion.estimation.filters.sigma_points import (
@@ -79,8 +79,7 @@ class UnscentedFilter(Filter):
             _, step, P = _joint(errors, seen, z, np.eye(len(z)), self.P)
             self.state.x[:] = prior.x
             self.state.retract(step)
-            moved = self.state.minus(at)
-            if np.linalg.norm(moved[:3]) < 1e-4 and np.linalg.norm(moved[3:6]) < 1e-3:
+            if is_small(self.state.minus(at)):
                 break
         corrected = self.state.minus(prior)
         self.surprise = float(corrected @ np.linalg.solve(self.P, corrected))
