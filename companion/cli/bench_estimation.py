@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from companion.cli.bench_rows import check_out, written
 from companion.cli.bench_tracking import GUSTS, course_mission, one_of, speed_limits
-from companion.cli.bus_options import Json, say
+from companion.cli.bus_options import Json
 from companion.cli.flight_input import stack_config
 from companion.cli.simulation import open_simulator
 from companion.config import Config
@@ -54,23 +54,17 @@ def estimation(
     Each flight is flown by the truth and recorded once, then replayed into the estimators. NEES is per degree of
     freedom: 1 is honest. CPU times are those of this thread. JSON is also printed if standard output is no terminal.
     """
-    if out is not None and not out.parent.is_dir():
-        raise InputError("no such folder", field="--out", file=str(out.parent))
+    check_out(out)
     asked = faults or ["none"]
     for text in asked:
         fault(text)
     if with_peers and missing():
         Console(stderr=True).print(f"no {', '.join(missing())}: pip install 'understory[bench]'", style="dim")
-    config, console, done = stack_config(None, tuple(set_ or ())), Console(), list[EstimationRow]()
+    config, console = stack_config(None, tuple(set_ or ())), Console()
     plain = as_json or not console.is_terminal
     with tempfile.TemporaryDirectory() as scratch:
         folders = [(flight, flight.name)] if flight else _folders(courses, speeds, seeds, recordings or Path(scratch))
-        for row in _rows(folders, asked, config, with_peers=with_peers):
-            done.append(row)
-            if plain:
-                say(msgspec.json.encode(row).decode())
-            if out is not None:
-                out.write_bytes(msgspec.json.Encoder().encode_lines(done))
+        done = list(written(_rows(folders, asked, config, with_peers=with_peers), out=out, plain=plain))
     if not plain:
         console.print(estimation_table(done))
 

@@ -7,12 +7,12 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.bus_options import Json, say
+from companion.cli.bench_rows import check_out, written
+from companion.cli.bus_options import Json
 from companion.cli.flight_input import stack_config
 from companion.core.errors import InputError
 from companion.estimation.filters.interface import ESTIMATORS
@@ -48,21 +48,15 @@ def estimators(
     --flight alone: that simulated flight through EKF, UKF, graph and MCL.
     JSON is also printed if standard output is no terminal.
     """
-    if out is not None and not out.parent.is_dir():
-        raise InputError("no such folder", field="--out", file=str(out.parent))
+    check_out(out)
     names = _valid(estimator or list(ESTIMATORS), ESTIMATORS, "--estimator")
     wanted = _valid(study or [s for s in STUDIES if data or s not in ("rtk", "flow", "flights")], STUDIES, "--study")
-    console, done = Console(), []
+    console = Console()
     plain = as_json or not console.is_terminal
     flights = bench_flights(flight or [], for_s) if flight or "flights" in wanted else iter(())
-    for row in chain(_rows([] if flight else wanted, names, data, seeds), flights):
-        done.append(row)
-        if plain:
-            say(msgspec.json.encode(row).decode())
-        else:
+    for row in written(chain(_rows([] if flight else wanted, names, data, seeds), flights), out=out, plain=plain):
+        if not plain:
             console.print(table(row))
-        if out is not None:
-            out.write_bytes(msgspec.json.Encoder().encode_lines(done))
 
 
 def _rows(wanted: list[str], names: list[str], data: Path | None, seeds: int) -> Iterator[EstimatorRow]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.bus_options import Json, say
-from companion.core.errors import InputError
+from companion.cli.bench_rows import check_out, written
+from companion.cli.bus_options import Json
 from companion.runtime.bench.mapping import MappingRow, Options, bench_mapping
 
 _COLUMNS = (
@@ -42,18 +41,14 @@ def mapping(
     Peers and own code take turns in this process; times are CPU times. All rows take about half an hour.
     The peers come with: pip install 'understory[bench]'. JSON is also printed if standard output is no terminal.
     """
-    console, done = Console(), []
+    console, done = Console(), list[MappingRow]()
     plain = as_json or not console.is_terminal
-    if out is not None and not out.parent.is_dir():
-        raise InputError("no such folder", field="--out", file=str(out.parent))
-    for row in bench_mapping(rows or [], Options(scans=scans, rounds=rounds, data=data)):
+    check_out(out)
+    measured = bench_mapping(rows or [], Options(scans=scans, rounds=rounds, data=data))
+    for row in written(measured, out=out, plain=plain):
         done.append(row)
-        if plain:
-            say(msgspec.json.encode(row).decode())
-        else:
+        if not plain:
             console.print(f"{row.name}: {row.skipped or 'done'}", highlight=False)
-        if out is not None:
-            out.write_bytes(msgspec.json.Encoder().encode_lines(done))
     if not plain:
         console.print(mapping_table(done))
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import numpy as np
 import typer
 from rich.console import Console
 
-from companion.cli.bus_options import say
+from companion.cli.bench_rows import check_out, written
 from companion.cli.place_scenes import Eye, Way, drifting_poses, true_poses, way_length, way_through
 from companion.core.errors import InputError
 from companion.core.geometry import quaternion_from_yaw, rotation_from_quaternion
@@ -77,17 +76,17 @@ def places(
     for name in scenes or ():
         if name not in _SCENES:
             raise InputError(f"{name!r} is no scene", field="--scenes", valid=", ".join(_SCENES))
-    for folder, name in ((out and out.parent, "--out"), (pictures, "--pictures")):
-        if folder is not None and not folder.is_dir():
-            raise InputError("no such folder", field=name, file=str(folder))
-    rows: list[PlaceRow] = []
-    for name in scenes or _SCENES:
+    check_out(out)
+    if pictures is not None and not pictures.is_dir():
+        raise InputError("no such folder", field="--pictures", file=str(pictures))
+    for _ in written(_measured(scenes or list(_SCENES), _Asked(starts, pictures)), out=out, plain=True):
+        pass
+
+
+def _measured(names: list[str], asked: _Asked) -> Iterator[PlaceRow]:
+    for name in names:
         Console(stderr=True).print(name, style="dim", highlight=False)
-        for row in _SCENES[name](name, _Asked(starts, pictures)):
-            rows.append(row)
-            say(msgspec.json.encode(row).decode())
-    if out is not None:
-        out.write_bytes(msgspec.json.Encoder().encode_lines(rows))
+        yield from _SCENES[name](name, asked)
 
 
 def _loops(world: str, corners: Corners, agl_m: float) -> Scene:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.bus_options import Json, say
+from companion.cli.bench_rows import written
+from companion.cli.bus_options import Json
 from companion.core.errors import InputError
 from companion.planning.registry import PLANNERS
 from companion.runtime.bench.planners import PlannerRow, bench_planners
@@ -50,15 +50,8 @@ def planners(
         _exercise(console, grid, out, plain=plain)
         return
     asked = _known(only or list(PLANNERS), "--planner", list(PLANNERS))
-    done: list[PlannerRow] = []
-    for row in bench_planners(
-        _known(worlds or list(WORLDS), "--worlds", list(WORLDS)), asked, runs=runs, say=_progress
-    ):
-        done.append(row)
-        if plain:
-            say(msgspec.json.encode(row).decode())
-        if out is not None:
-            out.write_bytes(msgspec.json.Encoder().encode_lines(done))
+    places = _known(worlds or list(WORLDS), "--worlds", list(WORLDS))
+    done = list(written(bench_planners(places, asked, runs=runs, say=_progress), out=out, plain=plain))
     if not plain:
         console.print(facts_table(asked))
         for name in dict.fromkeys(row.world for row in done):
@@ -107,15 +100,10 @@ def cells(row: PlannerRow) -> list[str]:
 
 
 def _exercise(console: Console, grid: Path | None, out: Path | None, *, plain: bool) -> None:
-    answers = solve(_text(grid) if grid is not None else GRID)
-    if out is not None:
-        out.write_bytes(msgspec.json.Encoder().encode_lines(answers))
-    if plain:
-        for answer in answers:
-            say(msgspec.json.encode(answer).decode())
-        return
-    console.print(exercise_table(answers))
-    console.print(comment(answers), highlight=False)
+    answers = list(written(solve(_text(grid) if grid is not None else GRID), out=out, plain=plain))
+    if not plain:
+        console.print(exercise_table(answers))
+        console.print(comment(answers), highlight=False)
 
 
 def exercise_table(answers: list[Answer]) -> Table:

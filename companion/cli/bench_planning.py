@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.bus_options import Json, say
+from companion.cli.bench_rows import check_out, written
+from companion.cli.bus_options import Json
 from companion.core.errors import InputError
 from companion.runtime.bench.planning import ENCLOSED, PlanningOptions, bench_planning
 from companion.runtime.bench.planning_rows import PlanningRow
@@ -36,17 +36,11 @@ def planning(
     for name in worlds or ():
         if name not in _VALID:
             raise InputError(f"{name!r} is no world", field="--worlds", valid=", ".join(_VALID))
-    if out is not None and not out.parent.is_dir():
-        raise InputError("no such folder", field="--out", file=str(out.parent))
-    console, done = Console(), list[PlanningRow]()
+    check_out(out)
+    console = Console()
     plain = as_json or not console.is_terminal
     options = PlanningOptions(runs=runs, peer_runs=peer_runs, data=data)
-    for row in bench_planning(worlds or _VALID, options, say=_progress):
-        done.append(row)
-        if plain:
-            say(msgspec.json.encode(row).decode())
-        if out is not None:
-            out.write_bytes(msgspec.json.Encoder().encode_lines(done))
+    done = list(written(bench_planning(worlds or _VALID, options, say=_progress), out=out, plain=plain))
     if not plain:
         console.print(planning_table(done))
 

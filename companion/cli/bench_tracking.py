@@ -7,12 +7,12 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.bus_options import Json, say
+from companion.cli.bench_rows import check_out, written
+from companion.cli.bus_options import Json
 from companion.cli.flight_input import stack_config
 from companion.cli.simulation import Simulator, open_simulator
 from companion.core.errors import InputError
@@ -55,20 +55,16 @@ def tracking(
     Full simulator in lockstep: rigid body, autopilot over MAVLink, and estimators if --estimate own, which takes about
     twenty minutes for all rows. JSON is also printed if standard output is no terminal.
     """
-    if out is not None and not out.parent.is_dir():
-        raise InputError("no such folder", field="--out", file=str(out.parent))
+    check_out(out)
     laws = [one_of(m, METHODS, "--method") for m in methods or METHODS]
     source: Estimate = one_of(estimate, ESTIMATES, "--estimate")
     limits, console, done = speed_limits(speeds), Console(), []
     plain = as_json or not console.is_terminal
-    for row in rows(course, limits, laws, source, seed=seed, overrides=set_ or [], console=Console(stderr=True)):
+    flown = rows(course, limits, laws, source, seed=seed, overrides=set_ or [], console=Console(stderr=True))
+    for row in written(flown, out=out, plain=plain):
         done.append(row)
-        if plain:
-            say(msgspec.json.encode(row).decode())
-        else:
+        if not plain:
             console.print(f"{row.course}, {row.method}, {row.limit_m_s:g} m/s: done", highlight=False)
-        if out is not None:
-            out.write_bytes(msgspec.json.Encoder().encode_lines(done))
     if not plain:
         console.print(tracking_table(done))
 

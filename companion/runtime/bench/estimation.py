@@ -17,8 +17,8 @@ from companion.core.messages import Array
 from companion.core.rig import Rig
 from companion.runtime.bench.estimation_faults import fault
 from companion.runtime.bench.estimation_peers import Peer, peers
-from companion.runtime.bench.estimation_recording import true_biases
-from companion.runtime.bench.estimation_replay import Run, replay
+from companion.runtime.bench.estimation_recording import heard, true_biases
+from companion.runtime.bench.estimation_replay import Run, feed
 from companion.runtime.bench.estimation_score import (
     Nees,
     accuracy,
@@ -57,7 +57,7 @@ def bench_flight(
     """One row per fault, and one per peer on the flight without faults."""
     for text in faults:
         others = peers(max_range_m=PEER_RANGE_M) if with_peers and text == "none" else {}
-        run = replay(folder, config.estimation, config.rig, spoil=fault(text), others=list(others.values()))
+        run = feed(heard(folder), config.estimation, config.rig, spoil=fault(text), others=list(others.values()))
         yield own_row(run, flight, text, true_biases(folder))
         for name, peer in others.items():
             yield peer_row(name, peer, run, flight, config.rig)

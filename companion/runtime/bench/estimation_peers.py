@@ -74,11 +74,11 @@ def _kiss_step(max_range_m: float) -> Callable[[LidarScan], Array]:
     config.registration.max_num_threads = 1
     odometry = KissICP(config)
 
-    def step(scan: LidarScan) -> Array:
+    def _step(scan: LidarScan) -> Array:
         odometry.register_frame(scan.points_sensor.astype(np.float64), scan.point_age_s.max() - scan.point_age_s)
         return np.array(odometry.last_pose)
 
-    return step
+    return _step
 
 
 def _gicp_step(max_range_m: float) -> Callable[[LidarScan], Array]:
@@ -87,7 +87,7 @@ def _gicp_step(max_range_m: float) -> Callable[[LidarScan], Array]:
     target = small_gicp.GaussianVoxelMap(_GICP_VOXEL_M)
     poses = [np.eye(4), np.eye(4)]
 
-    def step(scan: LidarScan) -> Array:
+    def _step(scan: LidarScan) -> Array:
         near = (scan.points_sensor**2).sum(axis=1) < max_range_m**2
         cloud, _ = small_gicp.preprocess_points(
             scan.points_sensor[near].astype(np.float64), downsampling_resolution=_GICP_THIN_M, num_threads=1
@@ -99,4 +99,4 @@ def _gicp_step(max_range_m: float) -> Callable[[LidarScan], Array]:
         target.insert(cloud, poses[-1])
         return poses[-1]
 
-    return step
+    return _step

@@ -1,6 +1,6 @@
 """Replay a recording into the estimators, and keep what they said.
 
-run = replay(folder, EstimationConfig(), Rig(), spoil=shorter(12.0))
+run = feed(heard(folder), EstimationConfig(), Rig(), spoil=shorter(12.0))
 run.states[-1].p_odom, run.cpu_ms_per_scan("LioNode")
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from time import thread_time
 from typing import Any
 
@@ -19,7 +18,6 @@ from companion.core.rig import Rig
 from companion.estimation.config import EstimationConfig
 from companion.estimation.node import GraphNode, LioNode, PropagatorNode
 from companion.runtime.bench.estimation_peers import Peer
-from companion.runtime.bench.estimation_recording import heard
 from companion.runtime.lockstep import name
 
 Spoil = Callable[[Topic[Any], Any], Any]
@@ -43,23 +41,6 @@ class Run:
         return 1e3 * sum(s for n, s in self.cpu_s.items() if not nodes or n in nodes) / max(self.scans, 1)
 
 
-def replay(
-    folder: Path,
-    config: EstimationConfig,
-    rig: Rig,
-    *,
-    spoil: Spoil | None = None,
-    with_graph: bool = True,
-    others: Sequence[Peer] = (),
-    until_s: float = float("inf"),
-) -> Run:
-    """Feed a recording to fresh nodes, in the order of arrival; compute takes no time here.
-
-    `others` get each sweep right after the nodes, so that all run under the same conditions.
-    """
-    return feed(heard(folder), config, rig, spoil=spoil, with_graph=with_graph, others=others, until_s=until_s)
-
-
 def feed(
     messages: Iterable[tuple[int, Topic[Any], Any]],
     config: EstimationConfig,
@@ -70,7 +51,10 @@ def feed(
     others: Sequence[Peer] = (),
     until_s: float = float("inf"),
 ) -> Run:
-    """As `replay`, from messages that are at hand: arrival time in ns, topic, message."""
+    """Feed messages (arrival time in ns, topic, message) to fresh nodes, in their order; compute takes no time here.
+
+    `others` get each sweep right after the nodes, so that all run under the same conditions.
+    """
     run = Run()
     nodes: list[Node] = [LioNode(config, rig), PropagatorNode(config)]
     nodes += [GraphNode(config, rig)] if with_graph else []
