@@ -19,6 +19,7 @@ from companion.core.messages import Array, Array32, LocalMap
 from companion.planning.grid import WINDOW, build_steps, fill_nearest, path_free, sample_field, segment_free
 
 Cells = NDArray[np.int32]
+_ROUNDING = 1e-9  # cells: so far inside the border, no rounding leads out of the map
 Unknown = Literal["blocked", "stop_before", "optimistic"]
 
 
@@ -125,8 +126,8 @@ class FieldSpace:
         if part is None:
             return True
         inner_p, inner_q = p + part[0] * (q - p), p + part[1] * (q - p)
-        limit = np.array(self.map.state.shape) - 1e-9
-        return bool(segment_free(self.steps, np.clip(inner_p, 0.0, limit), np.clip(inner_q, 0.0, limit)))
+        low, high = _ROUNDING, np.array(self.map.state.shape) - _ROUNDING
+        return bool(segment_free(self.steps, np.clip(inner_p, low, high), np.clip(inner_q, low, high)))
 
     def path_free(self, path: Array) -> bool:
         """All segments of a polyline (N, 3), which must lie in the map."""
@@ -172,6 +173,27 @@ class FieldSpace:
         """Is the point inside the local map, `margin_m` from its border?"""
         low, high = self.bounds
         return bool(np.all(point >= low + margin_m) and np.all(point < high - margin_m))
+
+
+def part_around(local_map: LocalMap, points: Array) -> LocalMap:
+    """A copy of the box of the map that holds all cells on straight ways between points (N, 3) of it.
+
+    A space is built cell by cell: for a look at one way, a box costs a hundredth of the map.
+    """
+    shape, cell_m = np.array(local_map.state.shape), local_map.resolution_m
+    cells = (points - local_map.origin_odom) / cell_m
+    low = np.clip(np.floor(cells.min(axis=0)).astype(int) - 1, 0, shape - 1)
+    high = np.clip(np.floor(cells.max(axis=0)).astype(int) + 2, low + 1, shape)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    return LocalMap(
+        stamp_ns=local_map.stamp_ns,
+        origin_odom=local_map.origin_odom + low * cell_m,
+        resolution_m=cell_m,
+        state=local_map.state[box].copy(),
+        distance_m=local_map.distance_m[box].copy(),
+        unknown_distance_m=local_map.unknown_distance_m[box].copy(),
+        ground_z_odom=local_map.ground_z_odom[box[:2]].copy(),
+    )
 
 
 def fill_ground(local_map: LocalMap, *, fallback_z: float = math.nan) -> Array32 | None:

@@ -11,7 +11,7 @@ import numpy as np
 from companion.core.messages import Array, LocalMap
 from companion.planning.flown import Flown
 from companion.planning.polyline import arc_length, project
-from companion.planning.space import FieldSpace
+from companion.planning.space import FieldSpace, part_around
 
 _BEHIND_M = 0.2  # the vehicle's own place is not judged, nor what is behind it
 
@@ -24,7 +24,7 @@ def first_hit_m(flown: Flown, p_odom: Array, local_map: LocalMap, *, radius_m: f
     points, _ = flown.ahead_until_stop
     if len(points) < 2:
         return np.inf
-    space = FieldSpace(local_map, radius_m=radius_m, unknown="optimistic")
+    space = FieldSpace(part_around(local_map, points), radius_m=radius_m, unknown="optimistic")
     s, _ = project(points, p_odom)
     along = arc_length(points)
     ahead = np.flatnonzero((along > s + _BEHIND_M) & space.free(points))

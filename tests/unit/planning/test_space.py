@@ -1,11 +1,12 @@
 """The distance field's answers against brute force."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from companion.planning.space import FieldSpace, fill_ground
+from companion.planning.space import FieldSpace, fill_ground, part_around
 
 
 def dense(space, a, b, n=4000):
@@ -42,6 +43,19 @@ def test_segments_agree_with_dense_sampling(world, radius_m):
         assert free or not sampled or _grazes(space, a, b)
         answers.append(free)
     assert 0.03 < np.mean(answers) < 0.97
+
+
+def test_the_part_around_a_way_answers_as_the_whole(world):
+    whole, rng = FieldSpace(world, radius_m=0.3, unknown="optimistic"), np.random.default_rng(6)
+    low, high = whole.bounds
+    answers = []
+    for a in rng.uniform(low - 1.0, high + 1.0, (300, 3)):
+        way = a + np.cumsum(rng.normal(0.0, 0.5, (6, 3)), axis=0)
+        part = FieldSpace(part_around(world, way), radius_m=0.3, unknown="optimistic")
+        assert np.array_equal(part.free(way), whole.free(way))
+        answers += [whole.segment_free(p, q) for p, q in pairwise(way)]
+        assert [part.segment_free(p, q) for p, q in pairwise(way)] == answers[-5:]
+    assert 0.1 < np.mean(answers) < 0.95
 
 
 def _grazes(space, a, b):

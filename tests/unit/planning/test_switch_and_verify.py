@@ -5,9 +5,10 @@ import pytest
 
 from companion.planning.flown import Flown, braked, with_speeds
 from companion.planning.polyline import arc_length
+from companion.planning.smooth import SmoothConfig
 from companion.planning.space import FieldSpace
 from companion.planning.speed_profile import SpeedConfig
-from companion.planning.switch import SwitchConfig, better, same_class
+from companion.planning.switch import SwitchConfig, as_flown, better, same_class
 from companion.planning.verify import first_hit_m
 
 SHAPE = (150, 60, 30)  # 30 x 12 x 6 m
@@ -57,6 +58,15 @@ def test_one_of_another_class_must_be_better_by_its_margin(space):
     assert better(new, old, space, eager) == (True, False)
     assert better(new, old, space, slow)[0] is False
     assert better(around(8.0), old, space, slow) == (True, True)  # as long as `new`, but on the old side
+
+
+def test_a_raw_way_that_smoothing_makes_longer_does_not_replace_the_smooth_old_one(space):
+    """Tight around the post, both ways: raw it seems a gain, flown it is the old way again."""
+    tight = np.array([[13.6, 6.0, 2.0], [14.4, 6.95, 2.0], [15.6, 6.95, 2.0], [16.4, 6.0, 2.0]])
+    old = as_flown(tight[:1], tight, space, SmoothConfig(wished_extra_m=1.5))
+    config = SwitchConfig(same_share=0.97, same_m=0.0, other_share=0.97, other_m=0.0)
+    assert better(tight, old, space, config)[0] is True
+    assert better(as_flown(tight[:1], tight, space, SmoothConfig(wished_extra_m=1.5)), old, space, config)[0] is False
 
 
 def straight(space, limits):
