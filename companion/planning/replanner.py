@@ -182,13 +182,17 @@ class Replanner:
     # --- parts of flying ---------------------------------------------------------------
 
     def _find(self, spaces: Spaces, kept: Commitment, goal: Goal, rng: np.random.Generator) -> Route | None:
-        start = kept.head[-1]
+        """The goal itself; where another place may stand for it, one with all the clearance before less clearance."""
         known = kept.rest if len(kept.rest) else None
-        route = self._finder.find(spaces, start, self._goal_odom, accept_m=goal.radius_m, rng=rng, known_path=known)
-        if route is None and goal.if_blocked == "nearest_free":
-            wide = self.config.route.substitute_m
-            route = self._finder.find(spaces, start, self._goal_odom, accept_m=wide, rng=rng)
-        return route
+        substitute_m = self.config.route.substitute_m if goal.if_blocked == "nearest_free" else 0.0
+        return self._finder.find(
+            spaces,
+            kept.head[-1],
+            self._goal_odom,
+            accept_m=(goal.radius_m, max(substitute_m, goal.radius_m)),
+            rng=rng,
+            known_path=known,
+        )
 
     def _good(self, kept: Commitment, space: FieldSpace) -> bool:
         """Is the rest of the old way still as clear as it was planned, but for the slack?"""

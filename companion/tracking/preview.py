@@ -51,9 +51,13 @@ def preview(path: TrackedPath, here: PathPoint, v: Array, config: PreviewConfig)
 def _feed_forward(path: TrackedPath, seen: PathPoint, actual: float, config: PreviewConfig) -> Array:
     """v dv/ds along the tangent, v^2 dT/ds across it, and drag, for a vehicle at `actual` speed.
 
-    One that is slower than planned needs less braking and turning, none when it stands.
+    One that is slower than planned needs less braking and turning, none when it stands; one that is as fast as
+    planned ahead is not pulled on: it would leave its acceleration too fast.
     """
     share = min(max(actual / max(seen.speed, config.slow_m_s), 0.0), 1.0) ** 2
-    along = seen.pull * (1.0 if seen.pull > 0.0 else share) * seen.tangent
-    bent: Array = along + share * seen.speed**2 * seen.turn
+    along = share * seen.pull
+    if seen.pull > 0.0:
+        lag = seen.pull * config.reaction_s
+        along = seen.pull * min(max(2.0 * (seen.speed - actual) / max(lag, 1e-9), 0.0), 1.0)
+    bent: Array = along * seen.tangent + share * seen.speed**2 * seen.turn
     return limited(bent, path.accel_limit) + config.drag_per_s * seen.speed * seen.tangent

@@ -33,7 +33,7 @@ def test_it_keeps_clearance_and_knows_where_it_is(hop):
 
 
 def test_it_holds_its_speed_limit(hop):
-    assert hop.summary.max_speed_m_s < 2.0 * 1.15 + 0.1
+    assert hop.summary.max_speed_m_s < 2.0 * 1.1
 
 
 def test_a_step_that_cannot_be_done_in_time_ends_in_a_landing(fly):

@@ -159,7 +159,7 @@ class Flight:
         if output.topic is topics.TRAJECTORY:
             self.trajectory = output.message
             list(self.tracking.handle(topics.TRAJECTORY, output.message))
-        else:
+        elif output.topic is topics.PLAN:
             self.status = output.message
             self.states.append((self.now_ns, output.message.goal_id, output.message.state))
 

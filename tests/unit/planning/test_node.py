@@ -99,6 +99,18 @@ def test_a_goal_in_a_trunk_becomes_the_nearest_free_place(flights, local_map):
     assert flight.clearance_m > 0.3
 
 
+def test_a_stand_in_with_all_the_clearance_comes_before_the_goal_with_less(flights, local_map):
+    occupied = np.zeros((80, 60, 20), bool)
+    occupied[50:53, 25:28] = occupied[50:53, 35:38] = True  # 1.4 m of air between two posts
+    goal, ends = [10.3, 6.3, 2.0], {}
+    for blocked in ("fail", "nearest_free"):
+        bench = Bench(flights, local_map, occupied, [2.0, 6.0, 2.0])
+        bench.goal(flights.goal_at(goal, blocked=blocked))
+        ends[blocked] = bench.plan()[0].p_odom[-1]
+    assert np.linalg.norm(ends["fail"] - goal) < 0.3
+    assert 0.3 < np.linalg.norm(ends["nearest_free"] - goal) < 1.5
+
+
 def test_a_goal_in_a_trunk_that_must_not_be_replaced_is_blocked(flights, local_map):
     occupied = hall()
     trunk(occupied, 10.0, 6.0, half=0.4)

@@ -142,6 +142,12 @@ def test_velocity_and_acceleration_are_consistent_along_a_speed_ramp(x, sign):
     assert np.allclose(seen.a, [sign * 2.0, 0.0, 0.0], atol=0.05)
 
 
+def test_a_vehicle_as_fast_as_planned_ahead_is_not_pulled_on():
+    points = line(10.0)
+    seen = preview_at(points, ramp(points, 9.0), np.array([2.0, 0.0, 2.0]), np.array([3.5, 0.0, 0.0]))
+    assert np.allclose(seen.a, 0.0, atol=1e-9)  # the ramp is at 2.83 m/s here, at 3.2 m/s in its reaction time
+
+
 # --- in flight -------------------------------------------------------------------------
 
 
