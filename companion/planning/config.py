@@ -7,6 +7,7 @@ from typing import Annotated
 import msgspec
 
 from companion.planning.landing import LandingConfig
+from companion.planning.moving import MovingConfig
 from companion.planning.registry import PlannerSettings
 from companion.planning.route import RouteConfig
 from companion.planning.smooth import SmoothConfig
@@ -24,6 +25,7 @@ class PlanningConfig(PlannerSettings, frozen=True, forbid_unknown_fields=True, k
     smooth: SmoothConfig = SmoothConfig()
     speed: SpeedConfig = SpeedConfig()
     landing: LandingConfig = LandingConfig()
+    moving: MovingConfig = MovingConfig()
     commit_s: Annotated[float, msgspec.Meta(ge=0)] = 0.15
     """Flown before a new plan takes over: its latency and 0.1 s."""
     keep_slack_m: Metres = 0.1

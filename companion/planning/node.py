@@ -8,11 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from companion.core import topics
-from companion.core.messages import Array32, Goal, LocalMap, Odometry, PlanStatus, RangeReading, Trajectory, Why
+from companion.core.messages import (
+    Array32,
+    Goal,
+    LocalMap,
+    ObstacleTracks,
+    Odometry,
+    PlanStatus,
+    RangeReading,
+    Trajectory,
+    Why,
+)
 from companion.core.node import Node, Outputs, every, on
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import Flown
 from companion.planning.landing import Columns, beam_fault, stopping_place
+from companion.planning.moving import with_moving
 from companion.planning.polyline import at, cut, length, project
 from companion.planning.replanner import Replanner
 from companion.planning.situation import Situation
@@ -40,6 +51,7 @@ class PlanningNode(Node):
         self._replanner = Replanner(config, hull_radius_m=hull_radius_m, seed=seed)
         self._odometry: Odometry | None = None
         self._map: LocalMap | None = None
+        self._tracks: ObstacleTracks | None = None
         self._ground: Array32 | None = None
         self._ground_z = math.nan  # last seen under the vehicle
         warm_up(config, hull_radius_m=hull_radius_m)
@@ -62,6 +74,11 @@ class PlanningNode(Node):
     def take_range(self, message: RangeReading) -> None:
         """What is straight below."""
         self._range = message
+
+    @on(topics.OBSTACLE_TRACKS)
+    def take_tracks(self, message: ObstacleTracks) -> None:
+        """What moves."""
+        self._tracks = message
 
     def _above_a_place(self, goal: Goal, *, beyond_m: float = 0.0) -> Goal:
         """To land: fly above the nearest place where the column is known free; if there is none, stop and say so."""
@@ -124,7 +141,7 @@ class PlanningNode(Node):
         now = Situation(
             p_odom=odometry.p_odom,
             v_odom=odometry.v_odom,
-            local_map=local_map,
+            local_map=with_moving(local_map, self._tracks, odometry.stamp_ns, self.config.moving),
             ground=self._ground,
             ground_z=self._ground_z,
         )

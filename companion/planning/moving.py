@@ -1,0 +1,73 @@
+"""Where things that move will be is taken for blocked: planners then go round them, or brake, as before a trunk.
+
+A track is an upright cylinder. What it sweeps over the next seconds at its present velocity is blocked all that time:
+more than it needs, but no plan leans on when a walker passes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from companion.core.messages import Array, Array32, LocalMap, ObstacleTracks, freeze
+
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class MovingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How far ahead, and how thick."""
+
+    horizon_s: NotNegative = 1.5
+    """What a thing sweeps in this time is blocked; 0: where it is now."""
+    margin_m: NotNegative = 0.2
+    """Added to the radius seen: of a walker often one side alone is."""
+    half_height_m: Annotated[float, msgspec.Meta(gt=0)] = 1.5
+    """Blocked above and below the middle of what is seen of it."""
+    fresh_s: Annotated[float, msgspec.Meta(gt=0)] = 0.6
+    """Older tracks are forgotten."""
+
+
+def with_moving(local_map: LocalMap, tracks: ObstacleTracks | None, now_ns: int, config: MovingConfig) -> LocalMap:
+    """The map with the distances that hold if all that the tracks sweep from `now_ns` on is occupied; states stay.
+
+    Distances are exact up to a cell's half, truncated as the map's. Without fresh tracks it is `local_map` itself.
+    """
+    if tracks is None or not len(tracks.id) or abs(now_ns - tracks.stamp_ns) > config.fresh_s * 1e9:
+        return local_map
+    late_s = (now_ns - tracks.stamp_ns) * 1e-9
+    fields = local_map.distance_m.copy(), local_map.unknown_distance_m.copy()
+    for p, v, radius_m in zip(tracks.position_odom, tracks.velocity_odom, tracks.radius_m, strict=True):
+        here = p + late_s * v
+        swept = np.stack([here, here + config.horizon_s * v])
+        _lower(fields, local_map, swept, float(radius_m) + config.margin_m, config.half_height_m)
+    moved = replace(local_map, distance_m=fields[0], unknown_distance_m=fields[1])
+    freeze(moved)
+    return moved
+
+
+def _lower(fields: tuple[Array32, Array32], local_map: LocalMap, swept: Array, radius_m: float, half_m: float) -> None:
+    """Both fields (X, Y, Z), in place, where a cylinder that goes from swept[0] to swept[1] (2, 3) is nearer."""
+    cell, most = local_map.resolution_m, float(max(field.max() for field in fields))
+    reach = np.array([radius_m + most, radius_m + most, half_m + most])
+    low = np.floor((swept.min(axis=0) - reach - local_map.origin_odom) / cell).astype(int)
+    high = np.ceil((swept.max(axis=0) + reach - local_map.origin_odom) / cell).astype(int)
+    low, high = np.clip(low, 0, fields[0].shape), np.clip(high, 0, fields[0].shape)
+    x, y, z = (local_map.origin_odom[k] + (np.arange(low[k], high[k]) + 0.5) * cell for k in range(3))
+    plan = np.maximum(_from_segment(x[:, None], y[None, :], swept) - radius_m, 0.0)
+    beside = np.maximum(np.abs(z - 0.5 * (swept[0, 2] + swept[1, 2])) - half_m, 0.0)
+    nearer = np.hypot(plan[:, :, None], beside).astype(np.float32)
+    part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    for field in fields:
+        np.minimum(field[part], nearer, out=field[part])
+
+
+def _from_segment(x: Array, y: Array, ends: Array) -> Array:
+    """Distance in plan of places x (X, 1), y (1, Y) to the segment between two ends (2, 3), (X, Y)."""
+    way = ends[1, :2] - ends[0, :2]
+    dx, dy = x - ends[0, 0], y - ends[0, 1]
+    t = np.clip((dx * way[0] + dy * way[1]) / max(float(way @ way), 1e-9), 0.0, 1.0)
+    distance: Array = np.hypot(dx - t * way[0], dy - t * way[1])
+    return distance
