@@ -207,7 +207,7 @@ class LocalMap:
     resolution_m: float
     state: NDArray[np.uint8]  # 0 unknown, 1 free, 2 occupied, (X, Y, Z)
     distance_m: Array32  # to the nearest occupied cell's surface, truncated, (X, Y, Z)
-    unknown_distance_m: Array32  # to the nearest cell that is not known free, truncated
+    unknown_distance_m: Array32  # to the nearest cell that is not known free, truncated; (0, 0, 0): nobody asks for it
     ground_z_odom: Array32  # lowest ground seen per column, NaN: none, (X, Y)
 
 

@@ -28,6 +28,7 @@ _FARTHEST_CELLS = 100  # squares fit 16 bits
 _BYTE_CELLS = 10  # squares and their sums fit 8 bits
 _NEAREST_OCCUPIED = (0, 2)  # a state counts if (state ^ first) & second
 _NEAREST_NOT_FREE = (1, 3)
+_NOT_ASKED_FOR = np.empty((0, 0, 0), np.float32)
 
 
 class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -63,12 +64,13 @@ class DistanceField:
         padded = (ny + 2 * self._reach) * (nz + self._reach) + self._reach + _CHUNK
         self._slabs = np.empty((3, padded), kind)
 
-    def around(self, voxels: VoxelMap, center_odom: Array, stamp_ns: int) -> LocalMap:
+    def around(self, voxels: VoxelMap, center_odom: Array, stamp_ns: int, *, unknown: bool = True) -> LocalMap:
         """The snapshot in the box whose middle block holds `center_odom` (3,).
 
         A distance is that from the cell's centre to the nearest such cell's centre, less half
         a cell for that cell's surface, within 0 .. truncation_m. Cells beyond the box do not
-        count. Arrays are new and read-only.
+        count. Arrays are new and read-only. Without `unknown` the distance to what is not known
+        free is left out, which is half of the work.
         """
         edge_m = BLOCK * self.resolution_m
         corner = np.floor(center_odom / edge_m).astype(np.int64) - self._blocks // 2
@@ -80,7 +82,7 @@ class DistanceField:
             resolution_m=self.resolution_m,
             state=states,
             distance_m=self.distance_to_occupied(states),
-            unknown_distance_m=self._distances(states, _NEAREST_NOT_FREE),
+            unknown_distance_m=self._distances(states, _NEAREST_NOT_FREE) if unknown else _NOT_ASKED_FOR,
             ground_z_odom=self._ground(states, corner[2] * edge_m),
         )
         freeze(snapshot)

@@ -8,10 +8,20 @@ import msgspec
 import numpy as np
 
 from companion.core.geometry import rotation_from_quaternion
-from companion.core.messages import Array, MapStatus, PoseCorrections, RegisteredScan, Why
+from companion.core.messages import Array, Goal, MapStatus, PoseCorrections, RegisteredScan, Why
 from companion.core.node import Node, Outputs, on
 from companion.core.rig import Rig
-from companion.core.topics import CORRECTIONS, LOCAL_MAP, MAP_DELTA, MAP_FULL, MAP_STATUS, OCCUPIED, REGISTERED, WHY
+from companion.core.topics import (
+    CORRECTIONS,
+    GOAL,
+    LOCAL_MAP,
+    MAP_DELTA,
+    MAP_FULL,
+    MAP_STATUS,
+    OCCUPIED,
+    REGISTERED,
+    WHY,
+)
 from companion.mapping.correction import warm_correction
 from companion.mapping.decay import Decay, DecayConfig, decay
 from companion.mapping.distance_field import DistanceField, FieldConfig
@@ -63,6 +73,7 @@ class MappingNode(Node):
         self._decay = Decay(config.decay)
         self._share = MapShare(config.share)
         self._newest_ns = -1
+        self._unknown = False  # was a goal given that takes unknown space for blocked?
         self._said: list[str] = []
         self._compile()
 
@@ -92,7 +103,7 @@ class MappingNode(Node):
         yield from self._follow(scan)
         yield from self._tell_of_shelf(scan.stamp_ns)
         if self.scans % self.config.map_every == 0:
-            yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns))
+            yield LOCAL_MAP(self._field.around(self.voxels, scan.p_odom, scan.stamp_ns, unknown=self._unknown))
             yield MAP_STATUS(self._status(scan.stamp_ns))
         self.scans += 1
         yield from self._share.after_scan(self.voxels, scan.p_odom, stamp_ns=scan.stamp_ns)
@@ -101,6 +112,11 @@ class MappingNode(Node):
     def correct(self, corrections: PoseCorrections) -> None:
         """Let the map follow, a step with each scan from now on."""
         self.follower.take(corrections)
+
+    @on(GOAL)
+    def serve(self, goal: Goal) -> None:
+        """From the first goal on that takes unknown space for blocked, local maps say how far that is."""
+        self._unknown = self._unknown or goal.limits.unknown == "blocked"
 
     def _follow(self, scan: RegisteredScan) -> Outputs:
         done = self.follower.after_scan(scan.stamp_ns, scan.p_odom, scan.q_odom_body)

@@ -57,7 +57,7 @@ def gradient(local_map: LocalMap, points_odom: Array, *, unknown: Unknown = "fre
     It points away from the nearest obstacle; zero where the field is truncated or, along an axis,
     beyond the outermost cell centres; NaN where the point is not finite.
     """
-    field = local_map.distance_m if unknown == "free" else local_map.unknown_distance_m
+    field = _chosen(local_map, unknown)
     last = np.array(field.shape) - 1
     cell = _cells(local_map, points_odom) - 0.5
     reach = np.where((cell >= 0.0) & (cell <= last), 1.0 / local_map.resolution_m, 0.0 * cell)
@@ -80,7 +80,14 @@ def _field(local_map: LocalMap, radius_m: float, unknown: Unknown) -> Array32:
         raise InputError(f"{radius_m} m", field="radius_m", valid="above 0")
     if unknown not in ("free", "occupied"):
         raise InputError(repr(unknown), field="unknown", valid="free, occupied")
-    return local_map.distance_m if unknown == "free" else local_map.unknown_distance_m
+    return _chosen(local_map, unknown)
+
+
+def _chosen(local_map: LocalMap, unknown: Unknown) -> Array32:
+    field = local_map.distance_m if unknown == "free" else local_map.unknown_distance_m
+    if not field.size and local_map.state.size:
+        raise InputError("without the distance to unknown space", field="local_map", valid="unknown: free")
+    return field
 
 
 def _cells(local_map: LocalMap, points_odom: Array) -> Array:

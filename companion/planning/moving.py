@@ -38,18 +38,19 @@ def with_moving(local_map: LocalMap, tracks: ObstacleTracks | None, now_ns: int,
     if tracks is None or not len(tracks.id) or abs(now_ns - tracks.stamp_ns) > config.fresh_s * 1e9:
         return local_map
     late_s = (now_ns - tracks.stamp_ns) * 1e-9
-    fields = local_map.distance_m.copy(), local_map.unknown_distance_m.copy()
+    distance, unknown = local_map.distance_m.copy(), local_map.unknown_distance_m.copy()
+    fields = (distance, unknown) if unknown.size else (distance,)
     for p, v, radius_m in zip(tracks.position_odom, tracks.velocity_odom, tracks.radius_m, strict=True):
         here = p + late_s * v
         swept = np.stack([here, here + config.horizon_s * v])
         _lower(fields, local_map, swept, float(radius_m) + config.margin_m, config.half_height_m)
-    moved = replace(local_map, distance_m=fields[0], unknown_distance_m=fields[1])
+    moved = replace(local_map, distance_m=distance, unknown_distance_m=unknown)
     freeze(moved)
     return moved
 
 
-def _lower(fields: tuple[Array32, Array32], local_map: LocalMap, swept: Array, radius_m: float, half_m: float) -> None:
-    """Both fields (X, Y, Z), in place, where a cylinder that goes from swept[0] to swept[1] (2, 3) is nearer."""
+def _lower(fields: tuple[Array32, ...], local_map: LocalMap, swept: Array, radius_m: float, half_m: float) -> None:
+    """The fields (X, Y, Z), in place, where a cylinder that goes from swept[0] to swept[1] (2, 3) is nearer."""
     cell, most = local_map.resolution_m, float(max(field.max() for field in fields))
     reach = np.array([radius_m + most, radius_m + most, half_m + most])
     low = np.floor((swept.min(axis=0) - reach - local_map.origin_odom) / cell).astype(int)

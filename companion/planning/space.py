@@ -15,6 +15,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.core.errors import InputError
 from companion.core.messages import Array, Array32, LocalMap
 from companion.planning.grid import WINDOW, build_steps, fill_nearest, path_free, sample_field, segment_free
 
@@ -67,6 +68,10 @@ class FieldSpace:
         self.map, self.radius_m, self.unknown = local_map, radius_m, unknown
         self.origin, self.resolution_m = local_map.origin_odom, local_map.resolution_m
         self._field = local_map.unknown_distance_m if unknown == "blocked" else local_map.distance_m
+        if self._field.shape != local_map.state.shape:
+            raise InputError(
+                f"a field of {self._field.shape} cells", field="local_map", valid=f"{local_map.state.shape}"
+            )
         self._bands = self._bands_of(ground_z, agl_m)
         self.steps = self._built()
         """0: blocked; 1 + n: free, and a jump of n / JUMP_UNIT cells meets nothing blocked."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from companion.core.geometry import quaternion_from_yaw
-from companion.core.messages import RegisteredScan, freeze
+from companion.core.messages import Goal, Limits, RegisteredScan, freeze
 from companion.core.rig import Rig
-from companion.core.topics import LOCAL_MAP, MAP_STATUS, REGISTERED, WHY
+from companion.core.topics import GOAL, LOCAL_MAP, MAP_STATUS, REGISTERED, WHY
 from companion.mapping.distance_field import FieldConfig
 from companion.mapping.free_volume import cells_around
 from companion.mapping.memory import MemoryConfig
@@ -60,8 +60,38 @@ def test_points_land_where_the_pose_puts_them():
     assert len(node.voxels.occupied_centers()) == 1
 
 
+def goal(unknown):
+    limits = Limits(
+        speed=3.0, climb=1.0, accel=3.0, yaw_rate=1.5, clearance=0.4, unknown=unknown, agl_min=1.0, agl_max=6.0
+    )
+    return Goal(
+        stamp_ns=0,
+        id=1,
+        kind="fly",
+        p_odom=np.zeros(3),
+        agl_m=np.nan,
+        radius_m=0.3,
+        fly_through=False,
+        next_p_odom=np.empty((0, 3)),
+        yaw=np.nan,
+        if_blocked="fail",
+        limits=limits,
+    )
+
+
+def test_how_far_unknown_space_is_is_told_once_a_goal_needs_it():
+    node = MappingNode(msgspec.structs.replace(NEARBY, map_every=1), Rig(), hull_radius_m=0.35)
+    sizes = []
+    for k, unknown in enumerate(("stop_before", "blocked", "optimistic")):
+        list(node.handle(GOAL, goal(unknown)))
+        (local,) = feed(node, scan(k, [(3.0, 0.0, 1.0)]))
+        sizes.append(local.unknown_distance_m.shape)
+    assert sizes == [(0, 0, 0), local.state.shape, local.state.shape]
+
+
 def test_the_start_is_free_where_nothing_was_hit():
     node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
+    list(node.handle(GOAL, goal("blocked")))
     branch = (0.05, 0.05, 1.52)
     (local,) = feed(node, scan(1, [branch]))
     p = np.array([0.0, 0.0, 0.3])
@@ -136,6 +166,7 @@ def test_two_nodes_fed_alike_publish_the_same_bytes():
     runs = []
     for _ in range(2):
         node = MappingNode(NEARBY, Rig(), hull_radius_m=0.35)
+        list(node.handle(GOAL, goal("blocked")))
         maps = [m for k, c in enumerate(clouds) for m in feed(node, scan(k, c, p=(0.3 * k, 0, 1), misses=c[:50]))]
         runs.append(b"".join(m.distance_m.tobytes() + m.unknown_distance_m.tobytes() for m in maps))
     assert runs[0] == runs[1]

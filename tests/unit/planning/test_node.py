@@ -1,5 +1,7 @@
 """The planning node in flight, and what it does when there is no way."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -97,6 +99,16 @@ def test_a_goal_in_a_trunk_becomes_the_nearest_free_place(flights, local_map):
     assert flight.run(20, until=lambda f: f.status.state == "reached")
     assert 1.0 < np.linalg.norm(flight.vehicle.p - [10.0, 6.0, 2.0]) < 1.8
     assert flight.clearance_m > 0.3
+
+
+def test_unknown_taken_for_blocked_waits_for_a_map_that_knows_how_far_it_is(flights, local_map):
+    bench = Bench(flights, local_map, hall(), [2.0, 6.0, 2.0])
+    told = bench.map
+    bench.map = dataclasses.replace(told, unknown_distance_m=np.empty((0, 0, 0), np.float32))
+    bench.goal(flights.goal_at([10.0, 6.0, 2.0], unknown="blocked"))
+    assert bench.plan() == (None, None)
+    bench.map = told
+    assert np.linalg.norm(bench.plan()[0].p_odom[-1] - [10.0, 6.0, 2.0]) < 0.3
 
 
 def test_a_stand_in_with_all_the_clearance_comes_before_the_goal_with_less(flights, local_map):
