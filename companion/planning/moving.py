@@ -24,7 +24,7 @@ class MovingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """What a thing sweeps in this time is blocked; 0: where it is now."""
     margin_m: NotNegative = 0.2
     """Added to the radius seen: of a walker often one side alone is."""
-    half_height_m: Annotated[float, msgspec.Meta(gt=0)] = 1.5
+    half_height_m: Annotated[float, msgspec.Meta(gt=0)] = 2.5
     """Blocked above and below the middle of what is seen of it."""
     fresh_s: Annotated[float, msgspec.Meta(gt=0)] = 0.6
     """Older tracks are forgotten."""
