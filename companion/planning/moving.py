@@ -40,29 +40,32 @@ def with_moving(local_map: LocalMap, tracks: ObstacleTracks | None, now_ns: int,
     late_s = (now_ns - tracks.stamp_ns) * 1e-9
     distance, unknown = local_map.distance_m.copy(), local_map.unknown_distance_m.copy()
     fields = (distance, unknown) if unknown.size else (distance,)
+    most_m = float(distance.max())
     for p, v, radius_m in zip(tracks.position_odom, tracks.velocity_odom, tracks.radius_m, strict=True):
         here = p + late_s * v
         swept = np.stack([here, here + config.horizon_s * v])
-        _lower(fields, local_map, swept, float(radius_m) + config.margin_m, config.half_height_m)
+        size_m = np.array([float(radius_m) + config.margin_m, config.half_height_m])
+        for field in fields:
+            _lower(field, local_map, swept, size_m, most_m)
     moved = replace(local_map, distance_m=distance, unknown_distance_m=unknown)
     freeze(moved)
     return moved
 
 
-def _lower(fields: tuple[Array32, ...], local_map: LocalMap, swept: Array, radius_m: float, half_m: float) -> None:
-    """The fields (X, Y, Z), in place, where a cylinder that goes from swept[0] to swept[1] (2, 3) is nearer."""
-    cell, most = local_map.resolution_m, float(max(field.max() for field in fields))
-    reach = np.array([radius_m + most, radius_m + most, half_m + most])
+def _lower(field: Array32, local_map: LocalMap, swept: Array, size_m: Array, most_m: float) -> None:
+    """A field (X, Y, Z) up to `most_m`, in place, where a cylinder going from swept[0] to swept[1] (2, 3) is nearer.
+
+    `size_m` is its radius and half its height.
+    """
+    cell, reach = local_map.resolution_m, size_m[[0, 0, 1]] + most_m
     low = np.floor((swept.min(axis=0) - reach - local_map.origin_odom) / cell).astype(int)
     high = np.ceil((swept.max(axis=0) + reach - local_map.origin_odom) / cell).astype(int)
-    low, high = np.clip(low, 0, fields[0].shape), np.clip(high, 0, fields[0].shape)
+    low, high = np.clip(low, 0, field.shape), np.clip(high, 0, field.shape)
     x, y, z = (local_map.origin_odom[k] + (np.arange(low[k], high[k]) + 0.5) * cell for k in range(3))
-    plan = np.maximum(_from_segment(x[:, None], y[None, :], swept) - radius_m, 0.0)
-    beside = np.maximum(np.abs(z - 0.5 * (swept[0, 2] + swept[1, 2])) - half_m, 0.0)
-    nearer = np.hypot(plan[:, :, None], beside).astype(np.float32)
+    plan = np.maximum(_from_segment(x[:, None], y[None, :], swept) - size_m[0], 0.0)
+    beside = np.maximum(np.abs(z - 0.5 * (swept[0, 2] + swept[1, 2])) - size_m[1], 0.0)
     part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    for field in fields:
-        np.minimum(field[part], nearer, out=field[part])
+    np.minimum(field[part], np.hypot(plan[:, :, None], beside), out=field[part], casting="same_kind")
 
 
 def _from_segment(x: Array, y: Array, ends: Array) -> Array:

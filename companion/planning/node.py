@@ -138,7 +138,7 @@ class PlanningNode(Node):
         goal, odometry, local_map = self._replanner.goal, self._odometry, self._map
         if goal is None or odometry is None or local_map is None:
             return
-        if goal.limits.unknown == "blocked" and not local_map.unknown_distance_m.size:
+        if goal.kind == "fly" and goal.limits.unknown == "blocked" and not local_map.unknown_distance_m.size:
             return  # the maps that follow know how far unknown space is: mapping hears of the goal, too
         now = Situation(
             p_odom=odometry.p_odom,

@@ -182,17 +182,12 @@ class Replanner:
     # --- parts of flying ---------------------------------------------------------------
 
     def _find(self, spaces: Spaces, kept: Commitment, goal: Goal, rng: np.random.Generator) -> Route | None:
-        """The goal itself; where another place may stand for it, one with all the clearance before less clearance."""
+        """The goal or, where another place may stand for it, the nearest with all the clearance before less of that."""
         known = kept.rest if len(kept.rest) else None
-        substitute_m = self.config.route.substitute_m if goal.if_blocked == "nearest_free" else 0.0
-        return self._finder.find(
-            spaces,
-            kept.head[-1],
-            self._goal_odom,
-            accept_m=(goal.radius_m, max(substitute_m, goal.radius_m)),
-            rng=rng,
-            known_path=known,
-        )
+        accept_m = goal.radius_m
+        if goal.if_blocked == "nearest_free":
+            accept_m = max(accept_m, self.config.route.substitute_m)
+        return self._finder.find(spaces, kept.head[-1], self._goal_odom, accept_m=accept_m, rng=rng, known_path=known)
 
     def _good(self, kept: Commitment, space: FieldSpace) -> bool:
         """Is the rest of the old way still as clear as it was planned, but for the slack?"""

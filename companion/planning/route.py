@@ -111,44 +111,26 @@ class RouteFinder:
         start: Array,
         goal: Array,
         *,
-        accept_m: tuple[float, ...],
+        accept_m: float,
         rng: np.random.Generator,
         known_path: Array | None = None,
     ) -> Route | None:
-        """Route to within `accept_m` of the goal, or to the border of the map; None: not found.
-
-        Of several distances the later ones are tried before less clearance is.
-        """
+        """Route to within `accept_m` of the goal, or to the border of the map; None: not found."""
         for space in spaces:
             self.proven = False
             escape = escape_from(start, space, within_m=self.config.escape_m)
-            if escape is None:
+            place = place_for(goal, space, start, within_m=accept_m, margin_m=self.config.border_margin_m)
+            if escape is None or place is None:
                 continue
-            for within_m in dict.fromkeys(accept_m):
-                place = place_for(goal, space, start, within_m=within_m, margin_m=self.config.border_margin_m)
-                route = None if place is None else self._to(*place, escape, space, goal, rng, known_path)
-                if route is not None:
-                    return route
+            target, at_border = place
+            plan = self._planner.plan(
+                escape[-1], target, space, rng=rng, iterations=self.config.iterations, known_path=known_path
+            )
+            self.proven = plan.proof == "infeasible" and not at_border
+            if plan.solved:
+                off = float(np.linalg.norm(target - goal))
+                return _route(escape, plan, space, at_border=at_border, substitute=not at_border and off > 0.1)
         return None
-
-    def _to(
-        self,
-        target: Array,
-        at_border: bool,
-        escape: Array,
-        space: FieldSpace,
-        goal: Array,
-        rng: np.random.Generator,
-        known_path: Array | None,
-    ) -> Route | None:
-        """Route to one place, that of the goal or one in its stead."""
-        iterations = self.config.iterations
-        plan = self._planner.plan(escape[-1], target, space, rng=rng, iterations=iterations, known_path=known_path)
-        self.proven = plan.proof == "infeasible" and not at_border
-        if not plan.solved:
-            return None
-        off = float(np.linalg.norm(target - goal))
-        return _route(escape, plan, space, at_border=at_border, substitute=not at_border and off > 0.1)
 
     def extend(self, route: Route, goal: Array, *, most_m: float, rng: np.random.Generator) -> Array:
         """The way (N, 3) from a route's target towards the goal after it; one point: none found."""

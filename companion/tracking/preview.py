@@ -51,13 +51,11 @@ def preview(path: TrackedPath, here: PathPoint, v: Array, config: PreviewConfig)
 def _feed_forward(path: TrackedPath, seen: PathPoint, actual: float, config: PreviewConfig) -> Array:
     """v dv/ds along the tangent, v^2 dT/ds across it, and drag, for a vehicle at `actual` speed.
 
-    One that is slower than planned needs less braking and turning, none when it stands; one that is as fast as
-    planned ahead is not pulled on: it would leave its acceleration too fast.
+    One that is slower than planned needs less braking and turning, none when it stands. It is pulled on by no more
+    than makes it as fast as planned ahead in half its reaction time: else it leaves its acceleration too fast.
     """
     share = min(max(actual / max(seen.speed, config.slow_m_s), 0.0), 1.0) ** 2
-    along = share * seen.pull
-    if seen.pull > 0.0:
-        lag = seen.pull * config.reaction_s
-        along = seen.pull * min(max(2.0 * (seen.speed - actual) / max(lag, 1e-9), 0.0), 1.0)
+    missing = max(seen.speed - actual, 0.0) / max(0.5 * config.reaction_s, 1e-9)
+    along = min(seen.pull, missing) if seen.pull > 0.0 else share * seen.pull
     bent: Array = along * seen.tangent + share * seen.speed**2 * seen.turn
     return limited(bent, path.accel_limit) + config.drag_per_s * seen.speed * seen.tangent

@@ -107,6 +107,8 @@ def test_unknown_taken_for_blocked_waits_for_a_map_that_knows_how_far_it_is(flig
     bench.map = dataclasses.replace(told, unknown_distance_m=np.empty((0, 0, 0), np.float32))
     bench.goal(flights.goal_at([10.0, 6.0, 2.0], unknown="blocked"))
     assert bench.plan() == (None, None)
+    assert bench.goal(flights.goal_at([2.0, 6.0, 2.0], kind="hold", unknown="blocked"))[1].state == "flying"  # at once
+    bench.goal(flights.goal_at([10.0, 6.0, 2.0], unknown="blocked"))
     bench.map = told
     assert np.linalg.norm(bench.plan()[0].p_odom[-1] - [10.0, 6.0, 2.0]) < 0.3
 
