@@ -11,6 +11,7 @@ import pytest
 from companion.core.errors import InputError
 from companion.mapping.voxel_map import VoxelMap
 from companion.runtime.bench.mapping import ROWS, Options, bench_mapping
+from companion.runtime.bench.mapping_correction import correction_figures
 from companion.runtime.bench.mapping_forest import DENSE, fly, make_forest
 from companion.runtime.bench.mapping_insert import agreement, like_octomap, time_insertion, time_threads
 from companion.runtime.bench.mapping_thin import thin_recall
@@ -48,6 +49,14 @@ def test_maps_of_a_few_scans_agree(scans, ray_per):
     found = agreement(scans[:1], 0.2, ray_per=ray_per)
     assert found["known_voxels"] > 500_000
     assert min(found[key] for key in ("agreement", "free_recall", "occupied_recall", "occupied_precision")) > 0.9998
+
+
+@pytest.mark.slow
+def test_a_corrected_way_moves_all_but_its_end_in_bounded_steps():
+    found = correction_figures(length_m=100.0)
+    assert found["moved"] >= 3
+    assert 1 <= found["stayed"] <= found["moved"]
+    assert found["steps"] >= found["moved"]
 
 
 @pytest.mark.slow

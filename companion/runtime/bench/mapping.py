@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from companion.core.errors import InputError
+from companion.runtime.bench.mapping_correction import correction_figures
 from companion.runtime.bench.mapping_cycle import time_cycle
 from companion.runtime.bench.mapping_field import FieldPeer, time_field
 from companion.runtime.bench.mapping_forest import DENSE, FLIGHT_SCANS, OPEN, Lidar, fly, make_forest
@@ -155,6 +156,10 @@ def _cycle(options: Options) -> tuple[str, dict[str, float]]:
     return "OctoMap's insertion alone", time_cycle(_few_scans("os64"), rounds=options.rounds)
 
 
+def _correction(_: Options) -> tuple[str, dict[str, float]]:
+    return "", correction_figures()
+
+
 def _memory(_: Options) -> tuple[str, dict[str, float]]:
     return "", memory_figures()
 
@@ -189,5 +194,6 @@ ROWS: dict[str, tuple[Measurement, _Goal | None]] = {
     "thin_branches": (partial(_thin, "branches", "os64", 0.2), _THIN),
     "thin_branches_mid360": (partial(_thin, "branches", "mid360", 0.2), _THIN),
     "thin_branches_0.1": (partial(_thin, "branches", "os64", 0.1), _THIN),
+    "correction": (_correction, _Goal("correction_s", 2, at_most=True)),
     "memory": (_memory, _Goal("rss_growth_mb", 200, at_most=True)),
 }
