@@ -41,9 +41,16 @@ class Flown:
         speeds[-1] = 0.0
         return self.points[: end + 1], speeds
 
-    def strain(self, accel: float) -> float:
-        """Lateral acceleration over the limit, see `speed_profile.strain`."""
-        return strain(self.points, self.speeds, accel) if len(self.points) > 2 else 0.0
+    def strain(self, accel: float, p_odom: Array, v_odom: Array) -> float:
+        """Lateral acceleration over the limit, see `speed_profile.strain`, for a vehicle at that place and velocity.
+
+        One that is faster than planned slows down by the whole limit at most, whatever the plan says.
+        """
+        if len(self.points) < 3:
+            return 0.0
+        ahead = arc_length(self.points) - project(self.points, p_odom)[0]
+        least = np.sqrt(np.maximum(float(v_odom @ v_odom) - 2.0 * accel * ahead, 0.0))
+        return strain(self.points, np.where(ahead > 0.0, np.maximum(self.speeds, least), self.speeds), accel)
 
     def speed_at(self, s: float) -> float:
         """Planned speed at an arc length."""

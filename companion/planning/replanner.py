@@ -175,7 +175,7 @@ class Replanner:
             self._planned_radius_m = route.space.radius_m
         beyond = self._beyond(goal, route, now, rng)
         flown = self._flown_along(kept, np.vstack([way, beyond[1:]]), route.space, escape=escape)
-        if self.flown is not None and flown.strain(goal.limits.accel) > self.config.most_strain:
+        if self.flown is not None and flown.strain(goal.limits.accel, now.p_odom, now.v_odom) > self.config.most_strain:
             return self._stopped(self.flown, now, stop_m=-math.inf)  # too fast for it: slow down first
         return flown
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.messages import Limits
-from companion.planning.flown import with_speeds
+from companion.planning.flown import Flown, with_speeds
 from companion.planning.polyline import arc_length, length, project, resample
 from companion.planning.rrt_star import RRTStar, RRTStarConfig
 from companion.planning.smooth import SmoothConfig, smooth
@@ -150,3 +150,14 @@ def test_a_way_with_no_room_comes_back_as_it_was(local_map):
     fine = smooth(corner, space, SmoothConfig())
     assert space.path_free(fine)
     assert length(fine) <= length(corner) + 1e-6
+
+
+@pytest.mark.parametrize(("speed", "bend_at_m", "too_much"), [(1.0, 0.5, False), (2.4, 0.5, True), (2.4, 2.5, False)])
+def test_a_bend_too_near_for_the_speed_flown_is_strain_however_slow_the_plan(speed, bend_at_m, too_much):
+    """Radius 0.5 m at 1.1 m/s planned: 2.4 m/s2. From 2.4 m/s, 0.5 m of braking at 3 m/s2 leave 1.7 m/s."""
+    turn = np.linspace(0.0, np.pi / 2, 9)
+    bend = np.stack([bend_at_m + 0.5 * np.sin(turn), 0.5 * (1.0 - np.cos(turn)), np.full(9, 2.0)], axis=1)
+    points = resample(np.vstack([[[-0.5, 0.0, 2.0]], bend, [[bend_at_m + 0.5, 4.0, 2.0]]]), 0.1)
+    flown = Flown(points=points, speeds=np.full(len(points), 1.1), reach_m=4.0, stop_m=np.inf)
+    strain = flown.strain(3.0, np.array([0.0, 0.0, 2.0]), np.array([speed, 0.0, 0.0]))
+    assert (strain > 1.0) == too_much
