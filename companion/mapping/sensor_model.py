@@ -18,10 +18,10 @@ class SensorModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Inverse sensor model. Source: A. Hornung et al., "OctoMap", Autonomous Robots, 2013.
 
     Its own 0.4 for a miss and 0.12 for the clamp erase branches: one of 1 cm fills a twentieth of a
-    voxel, so that most scans see through it. Here one return outweighs seven scans without.
+    voxel, so that most scans see through it. Here one return outweighs eleven scans without.
     """
 
-    hit: _Probability = 0.7  # of being occupied, after one return
+    hit: _Probability = 0.8  # of being occupied, after one return
     miss: _Probability = 0.47  # of being occupied, after one ray went through
     lowest: _Probability = 0.3  # clamp: bounds how many hits make a free voxel occupied
     highest: _Probability = 0.97  # clamp: bounds how many misses clear an occupied voxel
