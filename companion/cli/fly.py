@@ -28,7 +28,8 @@ from companion.runtime.flight import Progress as Where
 from companion.runtime.flight_log import FlightLog
 from companion.runtime.lockstep import name
 from companion.runtime.log_file import Header
-from companion.stack import build
+from companion.stack import build, warm
+from sim.rehearsal import rehearse
 
 REHEARSAL_S = 3.0  # rest, first scans and images, arming, the beginning of the climb
 
@@ -142,7 +143,9 @@ def _header(request: Request, stack: list[Node]) -> Header:
 
 def _rehearse(sim: simulation.Simulator, request: Request) -> None:
     """Fly up to the climb with nodes that are thrown away, so that kernels are compiled before the flight."""
-    flight, _ = _prepare(sim, request, FlightLog(None), [])
+    rehearse(sim.config, sim.world)
+    flight, stack = _prepare(sim, request, FlightLog(None), [])
+    warm(request.config, stack)
     for _ in flight.run(limit_s=REHEARSAL_S):
         pass
     sim.renderer.cpu_s.update(dict.fromkeys(sim.renderer.cpu_s, 0.0))

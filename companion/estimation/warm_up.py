@@ -9,6 +9,7 @@ from companion.core.rig import Rig
 from companion.core.topics import CAMERA, IMU, LIDAR, LIO_STATE, ODOMETRY
 from companion.estimation.config import EstimationConfig
 from companion.estimation.lio_node import LioNode
+from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagator_node import PropagatorNode
 
 IMU_PERIOD_NS, SWEEP_NS, FRAME_NS = 5_000_000, 100_000_000, 66_666_667
@@ -17,9 +18,10 @@ SECONDS = 3
 
 def warm_up(config: EstimationConfig, rig: Rig) -> int:
     """Stand for 3 s among pillars, with nodes that are thrown away; returns how many states they gave."""
+    PointMap(PointMapConfig()).insert(np.zeros((1 << 17, 3), np.float32), np.eye(3), np.zeros(3))  # its table grows
     lio, propagator = LioNode(config, rig), PropagatorNode(config)
     rng = np.random.default_rng(0)
-    frame = rng.integers(0, 255, (rig.pinhole.height_px, rig.pinhole.width_px), dtype=np.uint8)
+    frame = rng.integers(0, 250, (rig.pinhole.height_px, rig.pinhole.width_px), dtype=np.uint8)
     outputs = []
     for stamp_ns in range(0, SECONDS * 1_000_000_000, IMU_PERIOD_NS):
         sample = freeze(_rest(stamp_ns))
@@ -28,7 +30,8 @@ def warm_up(config: EstimationConfig, rig: Rig) -> int:
         if stamp_ns % SWEEP_NS == 0 and stamp_ns:
             outputs += list(lio.handle(LIDAR, freeze(_sweep(stamp_ns, rng))))
         if stamp_ns % FRAME_NS < IMU_PERIOD_NS:
-            outputs += list(lio.handle(CAMERA, freeze(CameraImage(stamp_ns=stamp_ns, pixels=frame.copy()))))
+            noisy = frame + rng.integers(0, 5, frame.shape, dtype=np.uint8)  # the same again would be a frozen camera's
+            outputs += list(lio.handle(CAMERA, freeze(CameraImage(stamp_ns=stamp_ns, pixels=noisy))))
         states = [o.message for o in outputs if o.topic is LIO_STATE]
         for state in states[-1:]:
             _propagate(propagator, state, sample)
@@ -48,7 +51,8 @@ def _rest(stamp_ns: int) -> ImuSample:
 
 def _sweep(stamp_ns: int, rng: np.random.Generator) -> LidarScan:
     """Ground and four pillars around the sensor, with some beams that meet nothing."""
-    ground = rng.uniform([-12, -12, -0.3], [12, 12, -0.28], (4000, 3))
+    ground = rng.uniform([-12, -12, -0.5], [12, 12, -0.48], (4000, 3))
+    ground[2000:, :2] /= 8.0  # dense below the camera, which begins where it knows how far it looks
     turns, centres = rng.uniform(0, 2 * np.pi, 4000), rng.choice([-5.0, 5.0], (4000, 2))
     pillars = np.column_stack(
         [centres + 0.2 * np.column_stack([np.cos(turns), np.sin(turns)]), rng.uniform(0, 6, 4000)]

@@ -22,15 +22,15 @@ from companion.core.topics import (
     REGISTERED,
     WHY,
 )
-from companion.mapping.correction import warm_correction
-from companion.mapping.decay import Decay, DecayConfig, decay
+from companion.mapping.decay import Decay, DecayConfig
 from companion.mapping.distance_field import DistanceField, FieldConfig
 from companion.mapping.follow import FollowConfig, MapFollower
 from companion.mapping.free_volume import cells_around
 from companion.mapping.landmark_node import LandmarkConfig
-from companion.mapping.share import MapShare, ShareConfig, warm_share
+from companion.mapping.share import MapShare, ShareConfig
 from companion.mapping.shelf import Shelf
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from companion.mapping.warm_up import warm_up
 
 _Metres = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
 
@@ -75,7 +75,8 @@ class MappingNode(Node):
         self._newest_ns = -1
         self._unknown = False  # was a goal given that takes unknown space for blocked?
         self._said: list[str] = []
-        self._compile()
+        warm_up(self.voxels)
+        self._field.around(self.voxels, np.zeros(3), 0)
 
     @on(REGISTERED)
     def insert(self, scan: RegisteredScan) -> Outputs:
@@ -150,16 +151,6 @@ class MappingNode(Node):
             return cells_around(p_odom, radius_m=self.hull_radius_m, height_m=0.0, cell_m=cell_m)
         radius_m = max(self.hull_radius_m, self.config.start_free_radius_m)
         return cells_around(p_odom, radius_m=radius_m, height_m=self.config.start_free_height_m, cell_m=cell_m)
-
-    def _compile(self) -> None:
-        """Run every kernel once on nothing, so that the first scan does not wait for compilers."""
-        zero = np.zeros(3)
-        self.voxels.insert(np.empty((0, 3), np.float32), R_odom_body=np.eye(3), p_odom=zero, origin_odom=zero)
-        if self.config.decay.on:
-            decay(self.voxels, 0, self.config.decay, since_ns=0)
-        self._field.around(self.voxels, zero, 0)
-        warm_share(self.voxels)
-        warm_correction(self.config.voxels)
 
 
 def _usable(scan: RegisteredScan) -> bool:

@@ -61,7 +61,7 @@ def unexpected(points_body: Array32, R: Array, p: Array, known: Background, conf
 
 def clusters(points_odom: Array, config: ClusterConfig) -> Clusters:
     """Points (M, 3) joined into things; those too small or too wide are left out."""
-    points = points_odom[:: max(1, -(-len(points_odom) // config.max_points))]
+    points = np.ascontiguousarray(points_odom[:: max(1, -(-len(points_odom) // config.max_points))])
     if len(points) < config.min_points:
         return Clusters(np.empty((0, 3)), np.empty(0), np.empty(0, np.int64))
     label = np.full(len(points), -1, np.int64)
