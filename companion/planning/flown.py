@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from companion.core.messages import Array, Limits
+from companion.core.messages import Array, Limits, LocalMap
 from companion.planning.polyline import arc_length, at, cut, length, project, resample, without_repeats
 from companion.planning.space import FieldSpace
 from companion.planning.speed_profile import SpeedConfig, known_free_m, spacing_of, speed_profile, strain
@@ -108,10 +108,12 @@ def with_speeds(
     start_speed: float,
     reach_m: float,
     stop_m: float = math.inf,
+    still_map: LocalMap | None = None,
 ) -> Flown:
     """Speeds for a path (N, 3): slow near obstacles, a stop at `stop_m` or before unknown space.
 
-    Space counts as known when a ball of `known_radius_m` ahead is (the hull's at least).
+    Space counts as known when a ball of `known_radius_m` ahead is (the hull's at least). A way that begins too near to
+    what moves is as fast as `still_map`, which is without that, allows: one gets out of the way, and does not creep.
     """
     path = without_repeats(path)
     if len(path) < 2:
@@ -121,6 +123,9 @@ def with_speeds(
         known = known_free_m(points, space.map, config, (known_radius_m, hull_radius_m))
         stop_m = min(stop_m, max(known - config.stop_margin_m, 0.0))
     clearance_m = space.distance(points) - hull_radius_m
+    if still_map is not None and still_map is not space.map:
+        leaving = ~np.logical_or.accumulate(clearance_m >= limits.clearance)
+        clearance_m = np.where(leaving, space.distance_in(still_map, points) - hull_radius_m, clearance_m)
     speeds = speed_profile(points, limits, config, clearance_m=clearance_m, start_speed=start_speed, stop_m=stop_m)
     return Flown(points=points, speeds=speeds, reach_m=reach_m, stop_m=stop_m)
 

@@ -144,6 +144,7 @@ class PlanningNode(Node):
             p_odom=odometry.p_odom,
             v_odom=odometry.v_odom,
             local_map=with_moving(local_map, self._tracks, odometry.stamp_ns, self.config.moving),
+            still_map=local_map,
             ground=self._ground,
             ground_z=self._ground_z,
         )

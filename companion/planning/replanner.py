@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from companion.core.messages import PROVEN, Array, Goal
+from companion.core.messages import PROVEN, Array, Goal, LocalMap
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import SLOW_M_S, Commitment, Flown, braked, clear_m, commit, with_speeds
 from companion.planning.polyline import cut, length, project, resample, without_repeats
@@ -47,6 +47,7 @@ class Replanner:
         self._planned_radius_m = hull_radius_m
         self._at_border = self._substitute = False
         self._begun = False  # the present goal was planned for
+        self._still: LocalMap | None = None  # the newest map, without what moves
 
     def take_goal(self, goal: Goal) -> None:
         """A new goal; the way being flown stays until the next `update`."""
@@ -101,6 +102,7 @@ class Replanner:
         """Replan; the answer is also kept as `flown`."""
         assert self.goal is not None
         self._replans += 1
+        self._still = now.still_map
         if self._begun:
             self.look(now.p_odom, now.v_odom)
         first = self.flown is None
@@ -288,4 +290,5 @@ class Replanner:
             start_speed=start_speed,
             reach_m=reach_m,
             stop_m=stop_m,
+            still_map=self._still,
         )

@@ -13,6 +13,7 @@ class Situation:
 
     p_odom: Array
     v_odom: Array
-    local_map: LocalMap
+    local_map: LocalMap  # with what moves
+    still_map: LocalMap  # without
     ground: Array32 | None  # filled, (X, Y)
     ground_z: float  # last seen under the vehicle

@@ -140,7 +140,11 @@ class FieldSpace:
 
     def distance(self, points: Array) -> Array:
         """Trilinear distance to the nearest occupied cell (N,), m; truncated as the map's."""
-        values: Array = sample_field(self.map.distance_m, np.ascontiguousarray(self.to_cells(points)))
+        return self.distance_in(self.map, points)
+
+    def distance_in(self, same_box: LocalMap, points: Array) -> Array:
+        """The same in another map of the same cells."""
+        values: Array = sample_field(same_box.distance_m, np.ascontiguousarray(self.to_cells(points)))
         return values
 
     def nearest_free(self, point: Array, *, within_m: float) -> Array | None:

@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 
 from companion.core.geometry import rotation_from_quaternion
-from companion.core.messages import LocalMap, ObstacleTracks, RegisteredScan
+from companion.core.messages import Array, LocalMap, ObstacleTracks, RegisteredScan
 from companion.core.node import Node, Outputs, on
 from companion.core.topics import LOCAL_MAP, OBSTACLE_TRACKS, REGISTERED
 from companion.estimation.tracks.tracker import Tracker, TrackerConfig
-from companion.estimation.tracks.unexpected import Background, ClusterConfig, clusters, unexpected
+from companion.estimation.tracks.unexpected import Background, ClusterConfig, beside, clusters, joined, unexpected
 
-_MAPS = 12  # kept at most
+_MAPS = 24  # kept at most
 
 
 class ObstacleTracksConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -23,6 +23,8 @@ class ObstacleTracksConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
 
     enabled: bool = True
     map_age_s: Annotated[float, msgspec.Meta(gt=0, le=2)] = 0.8  # of the map that says what is expected, at least
+    old_map_age_s: Annotated[float, msgspec.Meta(gt=0, le=4)] = 3.2  # of the map asked, too, beside what moves
+    beside_m: Annotated[float, msgspec.Meta(ge=0)] = 1.5  # how near that is, in plan
     every_scans: Annotated[int, msgspec.Meta(ge=1, le=5)] = 2  # scans per look
     clusters: ClusterConfig = ClusterConfig()
     tracker: TrackerConfig = TrackerConfig()
@@ -55,23 +57,30 @@ class ObstacleTracksNode(Node):
         self._scans += 1
         if self._scans % self.config.every_scans:
             return
-        known = self._expected(scan.stamp_ns)
+        known = self._expected(scan.stamp_ns, self.config.map_age_s)
         if known is None or scan.stamp_ns <= self.tracker.stamp_ns or not np.isfinite(scan.p_odom).all():
             return
-        R = rotation_from_quaternion(scan.q_odom_body)
-        points = unexpected(scan.points_body, R, scan.p_odom, known, self.config.clusters)
-        self.tracker.update(clusters(points, self.config.clusters), scan.stamp_ns)
+        self.tracker.update(clusters(self._news(scan, known), self.config.clusters), scan.stamp_ns)
         tracks = self.tracker.confirmed
         if tracks or self._said:
             yield OBSTACLE_TRACKS(self._message(scan.stamp_ns))
         self._said = len(tracks)
 
-    def _expected(self, stamp_ns: int) -> Background | None:
-        """The newest map that is old enough; older ones are let go."""
-        age_ns = round(self.config.map_age_s * 1e9)
-        while len(self._maps) > 1 and self._maps[1].stamp_ns <= stamp_ns - age_ns:
-            self._maps.popleft()
-        return self._maps[0] if self._maps and self._maps[0].stamp_ns <= stamp_ns - age_ns else None
+    def _news(self, scan: RegisteredScan, known: Background) -> Array:
+        """Points (M, 3) in odom that are new; beside what moves also those that a longer memory calls new."""
+        R, config = rotation_from_quaternion(scan.q_odom_body), self.config
+        points = unexpected(scan.points_body, R, scan.p_odom, known, config.clusters)
+        places = self.tracker.expected_odom(scan.stamp_ns)
+        old = self._expected(scan.stamp_ns, config.old_map_age_s) if len(places) else None
+        if old is None:
+            return points
+        more = unexpected(scan.points_body, R, scan.p_odom, old, config.clusters)
+        return joined(points, beside(more, places, config.beside_m))
+
+    def _expected(self, stamp_ns: int, age_s: float) -> Background | None:
+        """The newest map that is old enough."""
+        age_ns = round(age_s * 1e9)
+        return next((m for m in reversed(self._maps) if m.stamp_ns <= stamp_ns - age_ns), None)
 
     def _message(self, stamp_ns: int) -> ObstacleTracks:
         tracks = self.tracker.confirmed

@@ -27,12 +27,14 @@ class TrackerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Model of motion, gate, and when a track is believed and dropped."""
 
     accel_density_m2_s3: Positive = 1.0
-    sigma_m: Positive = 0.15  # of a cluster's middle about the thing's
-    first_speed_m_s: Positive = 1.5  # sigma of a new track's velocity
+    sigma_m: Positive = 0.15  # of a cluster's middle about the thing's, in plan
+    sigma_height_m: Positive = 0.5  # the same of its height: how much of a thing is seen changes
+    first_speed_m_s: Positive = 1.5  # sigma of a new track's velocity in plan
+    first_climb_m_s: Positive = 0.3  # and up
     gate_nis: Positive = 16.3  # 99.9 % of three axes
     hits: Count = 3  # clusters until it is believed ...
     moved_m: Positive = 0.6  # ... and way from where it was first seen
-    patience_s: Positive = 1.0  # without a cluster, believed
+    patience_s: Positive = 2.0  # without a cluster, believed: a thing below is out of sight
     doubt_s: Positive = 0.45  # without a cluster, not yet believed
 
 
@@ -62,6 +64,12 @@ class Tracker:
     def confirmed(self) -> list[Track]:
         """By id."""
         return [track for track in self.tracks if track.confirmed]
+
+    def expected_odom(self, stamp_ns: int) -> Array:
+        """Where the believed things should be at the stamp, (K, 3), m."""
+        dt_s = (stamp_ns - self.stamp_ns) * 1e-9
+        places = [track.filter.x[:3] + dt_s * track.filter.x[3:] for track in self.confirmed]
+        return np.array(places).reshape(-1, 3)
 
     def update(self, seen: Clusters, stamp_ns: int) -> None:
         """Predict to the stamp, assign clusters to tracks, correct, begin and end tracks."""
@@ -105,10 +113,12 @@ class Tracker:
 
     def _begin(self, seen: Clusters, k: int) -> None:
         centre = seen.centre_odom[k]
-        P = np.diag(np.repeat([self.config.sigma_m, self.config.first_speed_m_s], 3) ** 2)
+        c = self.config
+        speeds = [c.first_speed_m_s, c.first_speed_m_s, c.first_climb_m_s]
+        P = np.diag([c.sigma_m, c.sigma_m, c.sigma_height_m, *speeds]) ** 2
         start = KalmanFilter(np.concatenate([centre, np.zeros(3)]), P)
         self.tracks.append(Track(self.born, start, centre.copy(), self.stamp_ns, float(seen.radius_m[k])))
         self.born += 1
 
     def _noise(self) -> Array:
-        return self.config.sigma_m**2 * np.eye(3)
+        return np.diag([self.config.sigma_m, self.config.sigma_m, self.config.sigma_height_m]) ** 2

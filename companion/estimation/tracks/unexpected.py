@@ -1,7 +1,8 @@
 """Which points of a scan the map of a moment ago did not expect, and which of them belong together.
 
 A point in the midst of space that was seen free is where something has come to. The map must be
-older than the thing's stay there, else the thing is in it.
+older than the thing's stay there, else the thing is in it: what turns round comes back to where it was
+a moment ago, so beside what is believed to move a still older map is asked, too.
 """
 
 from __future__ import annotations
@@ -57,6 +58,20 @@ def unexpected(points_body: Array32, R: Array, p: Array, known: Background, conf
     place = (known.origin_odom, 1.0 / known.resolution_m)
     count = _unexpected(points_body, np.ascontiguousarray(R), p, known.state, place, config.range_m**2, found)
     return found[:count]
+
+
+def beside(points_odom: Array, places_odom: Array, within_m: float) -> Array:
+    """Those of the points (N, 3) that are, in plan, within a distance of one of the places (K, 3), (M, 3)."""
+    gap = np.linalg.norm((points_odom[:, None] - places_odom[None])[:, :, :2], axis=2)
+    near: Array = points_odom[(gap <= within_m).any(axis=1)]
+    return near
+
+
+def joined(first: Array, second: Array) -> Array:
+    """Points (N, 3) of both, each once, those of the first before the others."""
+    both = np.concatenate([first, second])
+    _, at = np.unique(both, axis=0, return_index=True)
+    return both[np.sort(at)]
 
 
 def clusters(points_odom: Array, config: ClusterConfig) -> Clusters:

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
-from companion.core.messages import ObstacleTracks
+from companion.core.messages import Limits, ObstacleTracks
+from companion.planning.flown import with_speeds
 from companion.planning.moving import MovingConfig, with_moving
+from companion.planning.space import FieldSpace
+from companion.planning.speed_profile import SpeedConfig
 
 SECOND = 1_000_000_000
 CONFIG = MovingConfig(horizon_s=1.5, margin_m=0.2, half_height_m=1.5)
@@ -81,3 +84,27 @@ def test_a_walker_is_kept_off(flights, local_map, first, v):
         gaps.append(np.hypot(*(flight.vehicle.p[:2] - at)) - 0.3 - flights.HULL_M)
     assert min(gaps) > 0.1
     assert flight.status.state == "reached"
+
+
+def test_one_gets_out_of_the_way_of_what_comes_as_fast_as_what_stands_allows(local_map):
+    """Creeping from a start within the sweep, at 0.6 m/s; 2.5 m/s would do where nothing stands."""
+    still = empty(local_map)
+    moved = with_moving(still, tracks([2.0, 5.0, 2.0], [1.5, 0.0, 0.0]), 0, CONFIG)
+    space = FieldSpace(moved, radius_m=0.86)
+    aside = np.array([[4.0, 5.0, 2.0], [4.0, 8.5, 2.0]])
+
+    limits = Limits(
+        speed=2.5, climb=1.0, accel=3.0, yaw_rate=1.0, clearance=0.4, unknown="optimistic", agl_min=0.0, agl_max=5.0
+    )
+
+    def speed_at(metres, still_map, path=aside):
+        radii = {"hull_radius_m": 0.36, "known_radius_m": 0.76}
+        flown = with_speeds(
+            path, space, limits, SpeedConfig(), **radii, start_speed=0.0, reach_m=3.5, still_map=still_map
+        )
+        return flown.speed_at(metres)
+
+    assert speed_at(0.8, None) == pytest.approx(0.6, abs=0.05)
+    assert speed_at(0.8, still) > 1.5
+    towards = aside[::-1].copy()  # what begins outside is as slow on its way in as before
+    assert speed_at(2.7, still, towards) == speed_at(2.7, None, towards)
