@@ -15,7 +15,7 @@ from companion.core.topics import LOCAL_MAP, OBSTACLE_TRACKS, REGISTERED
 from companion.estimation.tracks.tracker import Tracker, TrackerConfig
 from companion.estimation.tracks.unexpected import Background, ClusterConfig, beside, clusters, joined, unexpected
 
-_MAPS = 24  # kept at most
+_MAPS = 20  # kept at most
 
 
 class ObstacleTracksConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
