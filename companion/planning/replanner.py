@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from companion.core.messages import PROVEN, Array, Goal, LocalMap
+from companion.planning.aside import Aside
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import SLOW_M_S, Commitment, Flown, braked, clear_m, commit, with_speeds
 from companion.planning.polyline import cut, length, project, resample, without_repeats
@@ -48,10 +49,11 @@ class Replanner:
         self._at_border = self._substitute = False
         self._begun = False  # the present goal was planned for
         self._still: LocalMap | None = None  # the newest map, without what moves
+        self._aside: Aside | None = None  # of the place to hold
 
     def take_goal(self, goal: Goal) -> None:
         """A new goal; the way being flown stays until the next `update`."""
-        self.goal, self.reached, self._begun = goal, False, False
+        self.goal, self.reached, self._begun, self._aside = goal, False, False, None
         self._fails = self._standing.still = self._proofs = 0
         self._target = None
 
@@ -146,13 +148,16 @@ class Replanner:
         return self._paced(points, space, goal, start_speed=0.0, reach_m=length(path), stop_m=stop_m)
 
     def _hold(self, goal: Goal, now: Situation) -> Flown:
-        """Brake on the way, once; then stay."""
+        """Brake on the way, once; then stay, but for what moves: out of its way, and back."""
+        if self._begun and self._aside is not None and self._aside.is_left(now):
+            return self._fly(replace(goal, p_odom=self._aside.held_odom), now)
         self._target = self._goal_odom = now.p_odom
-        if self.flown is None:
-            return Flown.standing(now.p_odom)
-        if self._begun:
+        if self._begun and self.flown is not None:
             return self.flown
-        return self._stopped(self.flown, now, stop_m=-math.inf)
+        still = Flown.standing(now.p_odom)
+        flown = still if self.flown is None else self._stopped(self.flown, now, stop_m=-math.inf)
+        self._aside = Aside(flown.ahead_until_stop[0][-1], self._finder.least_radius_m(goal.limits))
+        return flown
 
     def _fly(self, goal: Goal, now: Situation) -> Flown:
         kept = commit(self.flown, now.p_odom, now.v_odom, time_s=self.config.commit_s)

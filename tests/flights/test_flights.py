@@ -76,3 +76,36 @@ def stem_goal():
     near = np.hypot(stems.x, stems.y)
     k = int(np.argmin(np.where(near > 8, near, np.inf)))
     return float(stems.x[k]), float(stems.y[k])
+
+
+CROSSED = """
+kind: poisson
+stems_per_ha: 200
+branches: 4
+walker_paths: [[[5, -6], [5, 6]]]
+walker_height_m: 2.8
+walker_speed_m_s: [1.2, 1.2]
+"""
+
+
+def test_where_somebody_walks_through_a_hovering_vehicle_it_steps_aside_and_comes_back(fly, tmp_path):
+    """The walker passes the place every 10 s, at most."""
+    world = tmp_path / "crossed.yaml"
+    world.write_text(CROSSED)
+    flight = fly(
+        """
+steps:
+  - {do: takeoff, alt: 2.0}
+  - {do: goto, at: [5, 0, 2], alt_ref: agl}
+  - {do: hover, seconds: 14}
+  - {do: land}
+""",
+        world=str(world),
+        seed=0,
+    )
+    assert flight.summary.completed, flight.summary.reason
+    assert flight.summary.min_clearance_m > 0.3
+    p = np.array([m.p_world for m in flight.tracks.truth])
+    there = np.linalg.norm(p[:, :2] - [5, 0], axis=1) < 0.5
+    first, last = np.flatnonzero(there)[[0, -1]]
+    assert np.linalg.norm(p[first:last, :2] - [5, 0], axis=1).max() > 0.8
