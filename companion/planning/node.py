@@ -27,7 +27,7 @@ from companion.planning.moving import with_moving
 from companion.planning.polyline import at, cut, length, project
 from companion.planning.replanner import Replanner
 from companion.planning.situation import Situation
-from companion.planning.space import fill_ground
+from companion.planning.space import fill_ground, serves
 from companion.planning.target import ground_below
 from companion.planning.warm_up import warm_up
 
@@ -138,7 +138,7 @@ class PlanningNode(Node):
         goal, odometry, local_map = self._replanner.goal, self._odometry, self._map
         if goal is None or odometry is None or local_map is None:
             return
-        if goal.kind == "fly" and goal.limits.unknown == "blocked" and not local_map.unknown_distance_m.size:
+        if goal.kind == "fly" and not serves(local_map, goal.limits.unknown):
             return  # the maps that follow know how far unknown space is: mapping hears of the goal, too
         now = Situation(
             p_odom=odometry.p_odom,

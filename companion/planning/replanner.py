@@ -156,7 +156,8 @@ class Replanner:
             return self.flown
         still = Flown.standing(now.p_odom)
         flown = still if self.flown is None else self._stopped(self.flown, now, stop_m=-math.inf)
-        self._aside = Aside(flown.ahead_until_stop[0][-1], self._finder.least_radius_m(goal.limits))
+        least_m, held = self._finder.least_radius_m(goal.limits), flown.ahead_until_stop[0][-1]
+        self._aside = Aside(held, least_m, goal.limits.unknown)
         return flown
 
     def _fly(self, goal: Goal, now: Situation) -> Flown:

@@ -184,6 +184,11 @@ class FieldSpace:
         return bool(np.all(point >= low + margin_m) and np.all(point < high - margin_m))
 
 
+def serves(local_map: LocalMap, unknown: Unknown) -> bool:
+    """Can a space with that policy be built on the map? Not every map says how far unknown space is."""
+    return unknown != "blocked" or local_map.unknown_distance_m.size > 0
+
+
 def part_around(local_map: LocalMap, points: Array) -> LocalMap:
     """A copy of the box of the map that holds all cells on straight ways between points (N, 3) of it.
 

@@ -23,7 +23,7 @@ def warm_up(config: PlanningConfig, *, hull_radius_m: float) -> None:
     start, goal = np.array([1.0, 1.0, 1.0]), np.array([3.0, 1.0, 1.0])
     seed = np.random.default_rng(0)
     planner = make_planner(config.route.planner, config)
-    planner.plan(start, goal, space, rng=seed, iterations=500)  # RRT-Connect first
+    planner.plan(start, goal, space, rng=seed, iterations=2000)  # RRT-Connect first, at last the lattice
     plan = planner.plan(start, goal, space, rng=seed, iterations=500, known_path=goal[None])
     planner.plan(start, _ENCLOSED, space, rng=seed, iterations=500)  # a proof, of planners that give one
     Wave(space.steps, space.to_cells(np.stack([start, goal])), block=1).path()

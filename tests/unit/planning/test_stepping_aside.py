@@ -1,10 +1,15 @@
 """A vehicle that holds gets out of the way of what moves, and comes back; it stays where nothing does."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from companion.core import topics
 from companion.core.messages import ObstacleTracks
+from companion.planning.aside import Aside
+from companion.planning.moving import MovingConfig, with_moving
+from companion.planning.situation import Situation
 
 HELD = np.array([6.0, 6.0, 2.0])
 WALKER_M = 0.35
@@ -57,3 +62,20 @@ def test_it_stays_where_nothing_comes_near(flights, local_map):
     flight, gaps = hold_among(flights, local_map, [HELD[0] - 4.0, 8.5, 1.4], [1.0, 0.0, 0.0], 8.0)
     assert gaps.min() < 2.0
     assert np.ptp(np.array(flight.trace)[:, :2], axis=0).max() < 0.1
+
+
+def test_it_waits_for_a_map_that_serves_its_policy_and_then_goes_on_until_told_otherwise(local_map):
+    """Without the distance to unknown space no plan that takes that for blocked can be made: no error, no leaving."""
+    still = local_map(hall())
+    poor = dataclasses.replace(still, unknown_distance_m=np.zeros((0, 0, 0), np.float32))
+    coming = tracks([HELD[0] - 1.0, HELD[1], 1.4], [1.0, 0.0, 0.0], 0)
+
+    def at(one, among=coming):
+        moving = with_moving(one, among, 0, MovingConfig())
+        return Situation(p_odom=HELD, v_odom=np.zeros(3), local_map=moving, still_map=one, ground=None, ground_z=0.0)
+
+    aside = Aside(HELD, 0.6, "blocked")
+    assert not aside.is_left(at(still, among=None))
+    assert not aside.is_left(at(poor))
+    assert aside.is_left(at(still, among=None))  # it has begun: the way back is planned, too
+    assert Aside(HELD, 0.6, "stop_before").is_left(at(poor))
