@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from companion.core.messages import Array
-from companion.planning.grid import sample_field
 from companion.planning.situation import Situation
-from companion.planning.space import Unknown, serves
+from companion.planning.space import Unknown, distance_in, serves
 
 
 @dataclass(slots=True, eq=False)
@@ -25,7 +22,6 @@ class Aside:
         """Is, or was, what moves too near to the vehicle, or about to be? False while the map serves no plan."""
         moving, still = now.local_map, now.still_map
         if not self.left and moving is not still:
-            cells = np.ascontiguousarray((now.p_odom - still.origin_odom)[None] / still.resolution_m)
-            near_m = [float(sample_field(one.distance_m, cells)[0]) for one in (moving, still)]
-            self.left = near_m[0] < min(self.radius_m, near_m[1])
+            moving_m, still_m = (float(distance_in(one, now.p_odom[None])[0]) for one in (moving, still))
+            self.left = moving_m < min(self.radius_m, still_m)
         return self.left and serves(moving, self.unknown)

@@ -9,7 +9,7 @@ import numpy as np
 
 from companion.core.messages import Array, Limits, LocalMap
 from companion.planning.polyline import arc_length, at, cut, length, project, resample, without_repeats
-from companion.planning.space import FieldSpace
+from companion.planning.space import FieldSpace, distance_in
 from companion.planning.speed_profile import SpeedConfig, known_free_m, spacing_of, speed_profile, strain
 
 SLOW_M_S = 0.2  # slower than this counts as standing
@@ -125,7 +125,7 @@ def with_speeds(
     clearance_m = space.distance(points) - hull_radius_m
     if still_map is not None and still_map is not space.map:
         leaving = ~np.logical_or.accumulate(clearance_m >= limits.clearance)
-        clearance_m = np.where(leaving, space.distance_in(still_map, points) - hull_radius_m, clearance_m)
+        clearance_m = np.where(leaving, distance_in(still_map, points) - hull_radius_m, clearance_m)
     speeds = speed_profile(points, limits, config, clearance_m=clearance_m, start_speed=start_speed, stop_m=stop_m)
     return Flown(points=points, speeds=speeds, reach_m=reach_m, stop_m=stop_m)
 

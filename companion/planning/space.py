@@ -140,12 +140,7 @@ class FieldSpace:
 
     def distance(self, points: Array) -> Array:
         """Trilinear distance to the nearest occupied cell (N,), m; truncated as the map's."""
-        return self.distance_in(self.map, points)
-
-    def distance_in(self, same_box: LocalMap, points: Array) -> Array:
-        """The same in another map of the same cells."""
-        values: Array = sample_field(same_box.distance_m, np.ascontiguousarray(self.to_cells(points)))
-        return values
+        return distance_in(self.map, points)
 
     def nearest_free(self, point: Array, *, within_m: float) -> Array | None:
         """Centre of the nearest free cell, or the point itself if free; None if there is none."""
@@ -182,6 +177,13 @@ class FieldSpace:
         """Is the point inside the local map, `margin_m` from its border?"""
         low, high = self.bounds
         return bool(np.all(point >= low + margin_m) and np.all(point < high - margin_m))
+
+
+def distance_in(local_map: LocalMap, points: Array) -> Array:
+    """Trilinear distance of points (N, 3) to the nearest occupied cell (N,), m; truncated as the map's."""
+    cells = np.ascontiguousarray((np.asarray(points, np.float64) - local_map.origin_odom) / local_map.resolution_m)
+    values: Array = sample_field(local_map.distance_m, cells)
+    return values
 
 
 def serves(local_map: LocalMap, unknown: Unknown) -> bool:
