@@ -16,7 +16,7 @@ from companion.core.geometry import (
     yaw_of,
 )
 from companion.core.messages import Array, Odometry, SmoothedState
-from companion.mission.route import Leg
+from companion.mission.route import TURN_RAD, Leg
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,10 +68,12 @@ class Places:
             return self.p_map_start + rotate(quaternion_from_yaw(self.yaw_map_start), leg.p)
         return leg.p + (self.p_map_home if leg.frame == "home" else 0.0)
 
-    def yaw_map(self, yaw: float | Literal["along_path", "hold"], frame: str) -> float:
+    def yaw_map(self, yaw: float | Literal["along_path", "hold", "turned"], frame: str) -> float:
         """Heading in map, rad; NaN: along the path."""
         if yaw == "along_path":
             return float("nan")
         if yaw == "hold":
             return self.yaw_map_start
+        if yaw == "turned":
+            return wrap_angle(self.yaw_map_start + TURN_RAD)
         return wrap_angle(yaw + (self.yaw_map_start if frame == "body" else 0.0))

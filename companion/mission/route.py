@@ -17,6 +17,7 @@ LEG_M = 10.0  # longer lanes are split, so that height and map correction are ta
 STRAIGHT_RAD = math.radians(20.0)
 SURVEY_RADIUS_M = 0.8
 HOME_RADIUS_M = 0.3
+TURN_RAD = 3.0  # on taking off; a little less than half round, so that the shorter way is sure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,7 +29,7 @@ class Leg:
     agl_m: float = math.nan
     radius_m: float = 0.5
     fly_through: bool = False
-    yaw: float | Literal["along_path", "hold"] = "along_path"
+    yaw: float | Literal["along_path", "hold", "turned"] = "along_path"
     if_blocked: Literal["nearest_free", "fail"] = "nearest_free"
     kind: Literal["takeoff", "fly"] = "fly"
 
@@ -40,7 +41,7 @@ def legs_of(mission: Mission, step: AnyStep, start_xy: tuple[float, float], *, l
     """
     match step:
         case Takeoff():
-            return (Leg(p=np.array([0.0, 0.0, step.alt]), radius_m=HOME_RADIUS_M, kind="takeoff"),)
+            return (_takeoff(step),)
         case Goto():
             return (_goto(step),)
         case FollowPath():
@@ -57,6 +58,11 @@ def home_leg(mission: Mission) -> Leg:
     """Back to above where the vehicle armed."""
     alt = mission.takeoff_alt_m
     return Leg(p=np.array([0.0, 0.0, alt]), agl_m=alt, radius_m=HOME_RADIUS_M)
+
+
+def _takeoff(step: Takeoff) -> Leg:
+    p = np.array([0.0, 0.0, step.alt])
+    return Leg(p=p, radius_m=HOME_RADIUS_M, yaw="turned" if step.turn else "along_path", kind="takeoff")
 
 
 def _goto(step: Goto) -> Leg:

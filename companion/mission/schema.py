@@ -59,9 +59,10 @@ class Step(StrictStruct, frozen=True, kw_only=True, tag_field="do"):
 
 
 class Takeoff(Step, frozen=True, kw_only=True, tag="takeoff"):
-    """Climb straight up to `alt` above home."""
+    """Climb straight up to `alt` above home, turning about: that tells the accelerometer's bias from a tilt."""
 
     alt: Annotated[float, msgspec.Meta(gt=0, le=120, extra={"unit": "m"})]
+    turn: bool = True
 
 
 class Goto(Step, frozen=True, kw_only=True, tag="goto"):

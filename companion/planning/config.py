@@ -34,6 +34,8 @@ class PlanningConfig(PlannerSettings, frozen=True, forbid_unknown_fields=True, k
     most_strain: Annotated[float, msgspec.Meta(gt=0)] = 1.0
     """A new way that asks for more than this times the acceleration limit across it waits until the
     vehicle is slower."""
+    turn_above_m: Metres = 0.5
+    """A takeoff turns only when it has risen this far."""
     ahead_m: Metres = 6.0
     """Planned beyond a goal that is flown through."""
     ground_within_m: Metres = 1.5

@@ -164,7 +164,7 @@ class PlanningNode(Node):
             p_odom=points.copy(),
             speed=speeds,
             accel_limit=goal.limits.accel,
-            yaw=_look(flown, odometry, goal),
+            yaw=_look(flown, odometry, goal, turn_above_m=self.config.turn_above_m),
             yaw_rate_limit=goal.limits.yaw_rate,
         )
 
@@ -190,12 +190,14 @@ class PlanningNode(Node):
         )
 
 
-def _look(flown: Flown, odometry: Odometry, goal: Goal) -> float:
+def _look(flown: Flown, odometry: Odometry, goal: Goal, *, turn_above_m: float) -> float:
     """Heading asked for; NaN: along the path.
 
     When the trajectory ends soon (unknown space ahead), along the route: looking there is what
     makes it known.
     """
+    if goal.kind == "takeoff" and odometry.p_odom[2] - flown.points[0, 2] < turn_above_m:
+        return math.nan
     if not math.isnan(goal.yaw) or goal.kind != "fly" or len(flown.points) < 2:
         return goal.yaw
     s, _ = project(flown.points, odometry.p_odom)

@@ -38,7 +38,7 @@ class Scenery:
 def draw_flight(path: Path, tracks: Tracks, scenery: Scenery, title: str) -> None:
     """Write `path` (PNG): trunks to scale, true path dark, estimate coloured by its error."""
     style.apply()
-    estimate, truth = aligned(tracks)
+    estimate, truth = aligned(tracks.map_track(), tracks.true_track())
     figure = plt.figure(figsize=(9.0, 9.6), layout="constrained")
     grid = figure.add_gridspec(3, 1, height_ratios=[5.2, 1.5, 1.1])
     above, side, error = (figure.add_subplot(grid[k]) for k in range(3))

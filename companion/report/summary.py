@@ -31,9 +31,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     world: str
     mission: str
     min_clearance_m: float  # of the hull to trunks and branches, true
-    position_rmse_m: float  # estimate against truth, aligned at the start pose only
+    position_rmse_m: float  # of the estimate in map against the truth; position and yaw of the start are aligned
     end_error_m: float
-    drift_percent: float  # mean relative translation error over 50 m segments, or end error / length
+    drift_percent: float  # of odometry: mean relative translation error over 50 m segments, or end error / length
     path_length_m: float
     mean_speed_m_s: float  # while moving
     max_speed_m_s: float
@@ -52,7 +52,7 @@ def trajectory_figures(tracks: Tracks) -> dict[str, float]:
     truth = tracks.true_track()
     if len(truth.t_s) < 2:
         return dict.fromkeys(_FIGURES, float("nan"))
-    estimate, truth_then = aligned(tracks)
+    estimate, truth_then = aligned(tracks.map_track(), truth)
     error = np.linalg.norm(estimate.p - truth_then.p, axis=1)
     speed = np.linalg.norm([m.v_world for m in tracks.truth], axis=1)
     moving = speed[speed > MOVING_M_S]
@@ -60,7 +60,7 @@ def trajectory_figures(tracks: Tracks) -> dict[str, float]:
         "min_clearance_m": min(m.clearance_m for m in tracks.truth),
         "position_rmse_m": float(np.sqrt((error**2).mean())) if len(error) else float("nan"),
         "end_error_m": float(error[-1]) if len(error) else float("nan"),
-        "drift_percent": drift_percent(estimate, truth_then),
+        "drift_percent": drift_percent(*aligned(tracks.estimated_track(), truth)),
         "path_length_m": path_length(truth.p),
         "mean_speed_m_s": float(moving.mean()) if len(moving) else 0.0,
         "max_speed_m_s": float(speed.max()),
@@ -93,9 +93,8 @@ def path_length(p: Array) -> float:
     return total
 
 
-def aligned(tracks: Tracks) -> tuple[Track, Track]:
+def aligned(estimate: Track, truth: Track) -> tuple[Track, Track]:
     """(estimate in the world, truth at the same times), aligned by yaw and position of the start alone."""
-    truth, estimate = tracks.true_track(), tracks.estimated_track()
     if not len(estimate.t_s):
         return estimate, estimate
     keep = estimate.t_s <= truth.t_s[-1]

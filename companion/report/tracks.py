@@ -9,7 +9,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from companion.core import topics
-from companion.core.messages import Array, GroundTruth, MissionStatus, Odometry, PlanStatus, SafetyStatus, Why
+from companion.core.geometry import quaternion_multiply, rotate
+from companion.core.messages import (
+    Array,
+    GroundTruth,
+    MissionStatus,
+    Odometry,
+    PlanStatus,
+    SafetyStatus,
+    SmoothedState,
+    Why,
+)
 from companion.core.node import Topic
 
 
@@ -24,6 +34,8 @@ class Tracks:
     mission: list[MissionStatus] = field(default_factory=list)
     safety: list[SafetyStatus] = field(default_factory=list)
     why: list[Why] = field(default_factory=list)
+    poses_map: list[MapPose] = field(default_factory=list)  # of each odometry, as odom then lay in map
+    _smoothed: SmoothedState | None = None
 
     def heard(self, topic: Topic[Any], message: Any) -> None:
         """Keep what the report needs."""
@@ -37,6 +49,10 @@ class Tracks:
         }
         if topic.name in lists:
             lists[topic.name].append(message)
+        if topic is topics.SMOOTHED:
+            self._smoothed = message
+        elif topic is topics.ODOMETRY:
+            self.poses_map.append(_in_map(message, self._smoothed))
 
     def true_track(self) -> Track:
         """Where the vehicle was, in the world."""
@@ -45,6 +61,27 @@ class Tracks:
     def estimated_track(self) -> Track:
         """Where the stack thought it was, in odom."""
         return _track(self.odometry, "p_odom", "q_odom_body", self.zero_ns)
+
+    def map_track(self) -> Track:
+        """The same in map, where a mission's goals lie: odometry through what was then known of odom in map."""
+        return _track(self.poses_map, "p_map", "q_map_body", self.zero_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class MapPose:
+    """A pose of the body in map."""
+
+    stamp_ns: int
+    p_map: Array  # (3,)
+    q_map_body: Array  # wxyz, (4,)
+
+
+def _in_map(odometry: Odometry, smoothed: SmoothedState | None) -> MapPose:
+    if smoothed is None:
+        return MapPose(odometry.stamp_ns, odometry.p_odom, odometry.q_odom_body)
+    q = smoothed.q_map_odom
+    p_map = rotate(q, odometry.p_odom) + smoothed.p_map_odom
+    return MapPose(odometry.stamp_ns, p_map, quaternion_multiply(q, odometry.q_odom_body))
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,8 +54,9 @@ class FollowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 class Follower:
     """`take` a trajectory, then ask for a `setpoint` every `period_s`.
 
-    Every setpoint's velocity is within the trajectory's top speed (or the PID's limit, if that is more), its
-    acceleration within the acceleration limit, and the velocity changes by at most change_share times that.
+    Every setpoint's velocity is within the trajectory's top speed (or what a slow path and the PID's limit at right
+    angles to it come to, if that is more), its acceleration within the acceleration limit, and the velocity changes
+    by at most change_share times that.
     """
 
     def __init__(self, config: FollowConfig, *, period_s: float) -> None:
@@ -148,9 +149,14 @@ class Follower:
         return demand.v * (1.0 - 0.75 * min(max(off, 0.0), 1.0))
 
     def _limited_velocity(self, along: Array, correction: Array, v: Array) -> Array:
-        """Sum within the top speed, the correction first, changing at most by the acceleration limit."""
+        """Sum within the top speed, the correction first, changing at most by the acceleration limit.
+
+        A correction never takes all of a slow path's speed: a climb that is off its line just above the ground,
+        and gave up climbing for it, would sink back onto its legs while it moves sideways.
+        """
         assert self._path is not None
-        top = max(self._path.top_speed, self.config.pid.output_limit_m_s)
+        most_aside, top = self.config.pid.output_limit_m_s, self._path.top_speed
+        top = max(top, math.hypot(min(top, most_aside), most_aside))
         wished = limited_sum(correction, along, top)
         last = limited(v, top) if self._v is None else limited(self._v, top)
         most = self.config.change_share * self._path.accel_limit * self.period_s

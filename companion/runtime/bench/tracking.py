@@ -13,7 +13,7 @@ import msgspec
 from companion.autopilot.node import AutopilotNode
 from companion.config import Config
 from companion.core.node import Node
-from companion.estimation.node import LioNode, PropagatorNode
+from companion.estimation.node import GraphNode, LioNode, PropagatorNode
 from companion.mission.model import Mission
 from companion.runtime.bench.tracking_flight import Flown, fly_course
 from companion.runtime.bench.tracking_pilot import Course, PilotNode, TrueOdometryNode
@@ -27,7 +27,7 @@ Estimate = Literal["own", "true"]
 METHODS: tuple[Method, ...] = get_args(Method)
 ESTIMATES: tuple[Estimate, ...] = get_args(Estimate)
 WORST_M = 0.25
-_ESTIMATORS: tuple[type[Node], ...] = (SensorsNode, LioNode, PropagatorNode)
+_ESTIMATORS: tuple[type[Node], ...] = (SensorsNode, LioNode, PropagatorNode, GraphNode)
 
 
 class TrackingRow(msgspec.Struct, frozen=True, kw_only=True):

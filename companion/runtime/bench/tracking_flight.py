@@ -17,6 +17,7 @@ from companion.core.errors import CompanionError
 from companion.core.geometry import quaternion_from_yaw, rotation_from_quaternion, yaw_of
 from companion.core.messages import Array, GroundTruth, Odometry, Setpoint
 from companion.core.node import Node, Topic
+from companion.mission.placing import Correction
 from companion.runtime.bench.tracking_pilot import Course, PilotNode
 from companion.runtime.lockstep import Lockstep
 
@@ -29,13 +30,13 @@ class Flown(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     course: Course
     time_s: Array  # (N,), of the truth
-    p_true: Array  # (N, 3), in odom as it was when the estimate began
+    p_true: Array  # (N, 3), in map as it was when the estimate began
     v_true: Array  # (N, 3)
     setpoint_s: Array  # (M,)
     setpoint_p: Array  # (M, 3)
     setpoint_v: Array  # (M, 3)
     setpoint_a: Array  # (M, 3)
-    p_odom: Array  # (N, 3), the estimate at the truth's times
+    p_map: Array  # (N, 3), the estimate at the truth's times
     clearance_m: float  # hull to trunks and branches, the smallest
     contact: str
     ended: bool  # came to rest at the end of the path
@@ -48,6 +49,8 @@ class Listener:
         self.truth: list[GroundTruth] = []
         self.setpoints: list[Setpoint] = []
         self.odometry: list[Odometry] = []
+        self.p_map: list[Array] = []  # where odometry was in map, as known then
+        self._correction = Correction.newest(None)
         self._kept: dict[str, list[Any]] = {
             topics.TRUTH.name: self.truth,
             topics.SETPOINT.name: self.setpoints,
@@ -56,6 +59,10 @@ class Listener:
 
     def published(self, now_ns: int, source: str, topic: Topic[Any], message: Any) -> int:
         """Keep it."""
+        if topic is topics.SMOOTHED:
+            self._correction = Correction.newest(message)
+        elif topic is topics.ODOMETRY:
+            self.p_map.append(self._correction.to_map(message.p_odom))
         if topic.name in self._kept:
             self._kept[topic.name].append(message)
         return 0
@@ -82,7 +89,7 @@ def _flown(pilot: PilotNode, heard: Listener) -> Flown:
     begun_ns = pilot.begun_ns or 0
     truth = [t for t in heard.truth if t.stamp_ns >= begun_ns]
     setpoints = [s for s in heard.setpoints if s.stamp_ns >= begun_ns]
-    turn, shift = _into_odom(heard)
+    turn, shift = _into_map(heard)
     p_true = _rows([t.p_world for t in truth]) @ turn.T + shift
     end = pilot.course.points[-1]
     return Flown(
@@ -94,15 +101,15 @@ def _flown(pilot: PilotNode, heard: Listener) -> Flown:
         setpoint_p=_rows([s.p_odom for s in setpoints]),
         setpoint_v=_rows([s.v_odom for s in setpoints]),
         setpoint_a=_rows([s.a_odom for s in setpoints]),
-        p_odom=_at([o.stamp_ns for o in heard.odometry], _rows([o.p_odom for o in heard.odometry]), truth),
+        p_map=_at([o.stamp_ns for o in heard.odometry], _rows(heard.p_map), truth),
         clearance_m=min((t.clearance_m for t in truth), default=float("nan")),
         contact=heard.truth[-1].contact if heard.truth else "",
         ended=pilot.done and len(p_true) > 0 and float(np.linalg.norm(p_true[-1] - end)) < 1.0,
     )
 
 
-def _into_odom(heard: Listener) -> tuple[Array, Array]:
-    """Turn (3, 3) and shift (3,) of the world into odom, by the first estimate: drift after it counts as error."""
+def _into_map(heard: Listener) -> tuple[Array, Array]:
+    """Turn (3, 3) and shift (3,) of the world into map, by the first estimate: drift after it counts as error."""
     first = heard.odometry[0]
     truth = min(heard.truth, key=lambda t: abs(t.stamp_ns - first.stamp_ns))
     turn = rotation_from_quaternion(quaternion_from_yaw(yaw_of(first.q_odom_body) - yaw_of(truth.q_world_body)))

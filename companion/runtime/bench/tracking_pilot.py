@@ -12,25 +12,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.core import topics
+from companion.core.geometry import wrap_angle, yaw_of
 from companion.core.messages import (
     Array,
     GroundTruth,
     Odometry,
     SafetyStatus,
+    SmoothedState,
     Trajectory,
     VehicleCommand,
     VehicleStatus,
 )
 from companion.core.node import Node, Outputs, every, on
+from companion.mission.placing import Correction
+from companion.mission.route import LEG_M, TURN_RAD
 
 _CLIMB_M_S, _CLIMB_ACCEL = 1.0, 1.0
 _CALM_S = 1.5  # hovering before the path begins, and after it has ended
+_TURN_ABOVE_M = 0.5
 _CLIMB_S = 8.0  # to the start of the path and for the autopilot's integrals to settle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Course:
-    """What is to be flown: `points` (N, 3) m, evenly spaced, from above the start; `speeds` (N,) m/s."""
+    """What is to be flown: `points` (N, 3) m in map, evenly spaced, from above the start; `speeds` (N,) m/s."""
 
     name: str
     points: Array
@@ -48,7 +53,11 @@ class Course:
 
 
 class PilotNode(Node):
-    """Says what planner, mission and guards would; `begun_ns` is when the path was first sent."""
+    """Says what planner, mission and guards would; `begun_ns` is when the path was first sent.
+
+    As in a mission, the vehicle turns half round as it climbs, and the path, which lies in map, is carried over into
+    odom anew every `LEG_M` of the way.
+    """
 
     publishes = (topics.TRAJECTORY, topics.SAFETY, topics.VEHICLE_COMMAND)
 
@@ -57,9 +66,13 @@ class PilotNode(Node):
         self.begun_ns: int | None = None
         self.done = False
         self._odometry: Odometry | None = None
+        self._smoothed: SmoothedState | None = None
+        self._placed = course.points  # in odom
+        self._placed_at = np.full(3, np.inf)  # where the vehicle was then, in odom
         self._vehicle: VehicleStatus | None = None
         self._up = _climb(float(course.points[0, 2]), course.points[0])
         self._up_ns: int | None = None
+        self._turned = math.nan  # heading once up
         self._rest_ns: int | None = None
         self._steps = 0
 
@@ -67,6 +80,11 @@ class PilotNode(Node):
     def take_odometry(self, message: Odometry) -> None:
         """Where the vehicle believes to be."""
         self._odometry = message
+
+    @on(topics.SMOOTHED)
+    def take_smoothed(self, message: SmoothedState) -> None:
+        """Where odom lies in map."""
+        self._smoothed = message
 
     @on(topics.VEHICLE)
     def take_vehicle(self, message: VehicleStatus) -> None:
@@ -94,27 +112,38 @@ class PilotNode(Node):
             yield topics.VEHICLE_COMMAND(VehicleCommand(stamp_ns=now_ns, kind="arm"))
 
     def _path(self, now_ns: int) -> Trajectory:
+        assert self._odometry is not None
         if self._up_ns is None:
-            self._up_ns = now_ns
+            self._up_ns, self._turned = now_ns, wrap_angle(yaw_of(self._odometry.q_odom_body) + TURN_RAD)
         points, speeds, accel = self._up
+        yaw = self._turned if self._odometry.p_odom[2] > _TURN_ABOVE_M else math.nan
         if now_ns - self._up_ns > _CLIMB_S * 1e9:
             self.begun_ns = now_ns if self.begun_ns is None else self.begun_ns
-            points, speeds, accel = self.course.points, self.course.speeds, self.course.accel
+            points, speeds, accel = self._in_odom(), self.course.speeds, self.course.accel
+            yaw = math.nan
         return Trajectory(
             stamp_ns=now_ns,
             goal_id=0 if self.begun_ns is None else 1,
             p_odom=points,
             speed=speeds,
             accel_limit=accel,
-            yaw=math.nan,
+            yaw=yaw,
             yaw_rate_limit=self.course.yaw_rate,
         )
+
+    def _in_odom(self) -> Array:
+        """The path, placed at the begin and after each leg."""
+        assert self._odometry is not None
+        if not np.linalg.norm(self._odometry.p_odom - self._placed_at) < LEG_M:
+            self._placed_at = self._odometry.p_odom
+            self._placed = Correction.newest(self._smoothed).to_odom(self.course.points)
+        return self._placed
 
     def _look(self, now_ns: int) -> None:
         """Done: near the end for a while, or twice as long under way as planned."""
         if self.begun_ns is None or self._odometry is None:
             return
-        near = float(np.linalg.norm(self._odometry.p_odom - self.course.points[-1])) < 0.4
+        near = float(np.linalg.norm(self._odometry.p_odom - self._placed[-1])) < 0.4
         self._rest_ns = (now_ns if self._rest_ns is None else self._rest_ns) if near else None
         calm = self._rest_ns is not None and now_ns - self._rest_ns > _CALM_S * 1e9
         self.done = calm or now_ns - self.begun_ns > (2.0 * self.course.seconds + 10.0) * 1e9

@@ -44,7 +44,7 @@ def score(flown: Flown) -> Score:
     points = flown.course.points
     s, off, side = along_and_across(points, flown.p_true)
     along = arc_length(points)
-    believed = along_and_across(points, flown.p_odom)[1]
+    believed = along_and_across(points, flown.p_map)[1]
     speed = np.linalg.norm(flown.v_true, axis=1)
     under_way = (s > _END_M) & (s < along[-1] - _END_M)
     planned = np.interp(s, along, flown.course.speeds)

@@ -39,6 +39,17 @@ def test_a_flight_is_offboard_arm_takeoff_steps_land():
     assert [g.id for g in flight.goals] == [1, 2, 3]
 
 
+@pytest.mark.parametrize("heading", [0.0, 2.0, -3.1])
+def test_a_takeoff_turns_about_unless_told_not_to(heading):
+    for step, turns in (("{do: takeoff, alt: 2}", True), ("{do: takeoff, alt: 2, turn: false}", False)):
+        flight = FakeFlight(f"{HEAD}steps:\n  - {step}\n  - {{do: land}}\n")
+        flight.yaw = heading
+        while not flight.goals:
+            flight.tick()
+        turn = (flight.goals[0].yaw - heading + np.pi) % (2 * np.pi) - np.pi
+        assert turn == pytest.approx(3.0) if turns else np.isnan(turn)
+
+
 def test_it_waits_until_the_vehicle_is_ready_and_says_why():
     flight = FakeFlight(mission(GO), ready_ns=5_000_000_000)
     flight.run(4.9)

@@ -181,6 +181,17 @@ def test_takeoff_goes_straight_up_through_unknown_but_not_into_a_branch(flights,
     assert 0.9 < trajectory.p_odom[-1, 2] < 2.2 - flights.HULL_M - 0.1
 
 
+def test_a_takeoff_turns_only_when_it_is_clear_of_the_ground(flights, local_map):
+    headings = {}
+    for height_m in (0.3, 0.7, 0.9, 1.5):
+        bench = Bench(flights, local_map, hall(), [5.1, 5.1, 0.3])
+        bench.plan()
+        bench.goal(dataclasses.replace(flights.goal_at([5.1, 5.1, 2.3], kind="takeoff"), yaw=2.5))
+        list(bench.node.handle(topics.ODOMETRY, odometry([5.1, 5.1, height_m])))
+        headings[height_m] = bench.plan()[0].yaw
+    assert np.isnan([headings[0.3], headings[0.7]]).all() and headings[0.9] == headings[1.5] == 2.5
+
+
 def test_hold_brakes_on_the_way_and_stays(flights, local_map):
     occupied = hall()
     flight = flights.Flight(local_map, occupied, [3.0, 6.0, 2.0], known=seen(occupied))

@@ -1,12 +1,14 @@
 """The figures of a flight, on tracks whose answer is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from companion.core.geometry import quaternion_from_yaw, quaternion_multiply, rotate
-from companion.core.messages import GroundTruth, Odometry
+from companion.core import topics
+from companion.core.geometry import quaternion_conjugate, quaternion_from_yaw, quaternion_multiply, rotate
+from companion.core.messages import GroundTruth, Odometry, SmoothedState
 from companion.report.summary import aligned, drift_percent, path_length, trajectory_figures
 from companion.report.tracks import Track, Tracks
 
@@ -27,20 +29,33 @@ def fly(p_world, *, scale=1.0, offset_yaw=0.0, offset=(0.0, 0.0, 0.0), yaw=0.3):
                 contact="", armed=True, battery_fraction=1.0,
             )
         )  # fmt: skip
-        tracks.odometry.append(
+        tracks.heard(
+            topics.ODOMETRY,
             Odometry(
                 stamp_ns=stamp_ns,
                 p_odom=rotate(q_turn, (p - p_world[0]) * scale) + offset,
                 q_odom_body=quaternion_multiply(q_turn, q),
                 v_odom=v, omega_body=np.zeros(3), pose_variance=np.ones(6), velocity_variance=np.ones(3),
                 measured_ns=stamp_ns, quality=1.0, reset_counter=0,
-            )
+            ),
         )  # fmt: skip
     return tracks
 
 
+def smoothed(stamp_ns, q_map_odom):
+    return SmoothedState(
+        stamp_ns=stamp_ns, p_map=np.zeros(3), q_map_body=np.array([1.0, 0, 0, 0]), v_map=np.zeros(3),
+        gyro_bias_body=np.zeros(3), accel_bias_body=np.zeros(3), p_map_odom=np.zeros(3), q_map_odom=q_map_odom,
+        pose_variance=np.ones(6), factors=1,
+    )  # fmt: skip
+
+
 def line(length_m, n=3000):
     return np.column_stack([np.linspace(0, length_m, n), np.zeros(n), np.full(n, 2.0)])
+
+
+def both(tracks):
+    return aligned(tracks.estimated_track(), tracks.true_track())
 
 
 def test_a_perfect_estimate_has_no_error_whatever_its_frame():
@@ -49,8 +64,25 @@ def test_a_perfect_estimate_has_no_error_whatever_its_frame():
     assert figures["drift_percent"] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_a_tilt_that_the_graph_knows_is_no_error():
+    """odom leans by 6 mrad; from 2 s on `estimation/smoothed` says so."""
+    truth, leaning = fly(line(120)), Tracks()
+    leaning.truth = truth.truth
+    q = np.array([np.cos(0.003), 0.0, np.sin(0.003), 0.0])  # map <- odom
+    for k, o in enumerate(truth.odometry):
+        if k == 100:
+            leaning.heard(topics.SMOOTHED, smoothed(o.stamp_ns, q))
+        body = quaternion_multiply(quaternion_conjugate(q), o.q_odom_body)
+        o_leaning = replace(o, p_odom=rotate(quaternion_conjugate(q), o.p_odom), q_odom_body=body)
+        leaning.heard(topics.ODOMETRY, o_leaning)
+    track = leaning.map_track()
+    assert np.abs(track.p[100:, 2]).max() < 1e-9 and track.p[99, 2] > 0.02
+    assert leaning.estimated_track().p[-1, 2] == pytest.approx(120 * 0.006, rel=1e-3)
+    assert trajectory_figures(leaning)["end_error_m"] == pytest.approx(0.0, abs=1e-3)
+
+
 def test_a_scale_error_of_one_percent_drifts_one_percent():
-    estimate, truth = aligned(fly(line(200), scale=1.01))
+    estimate, truth = both(fly(line(200), scale=1.01))
     assert drift_percent(estimate, truth) == pytest.approx(1.0, rel=1e-2)
 
 
@@ -64,7 +96,7 @@ def test_turning_between_two_samples_of_the_truth_is_no_drift():
 
 
 def test_a_short_flight_tells_its_end_error_over_its_length():
-    estimate, truth = aligned(fly(line(20), scale=1.02))
+    estimate, truth = both(fly(line(20), scale=1.02))
     assert drift_percent(estimate, truth) == pytest.approx(2.0, rel=2e-2)
 
 

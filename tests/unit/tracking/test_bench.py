@@ -23,7 +23,7 @@ def flown_along(course, offset, *, past_m=0.0):
     t = 0.02 * np.arange(len(p))
     return Flown(
         course=course, time_s=t, p_true=p, v_true=np.gradient(p, t, axis=0), setpoint_s=t, setpoint_p=p,
-        setpoint_v=np.gradient(p, t, axis=0), setpoint_a=0 * p, p_odom=p - offset, clearance_m=1.0, contact="",
+        setpoint_v=np.gradient(p, t, axis=0), setpoint_a=0 * p, p_map=p - offset, clearance_m=1.0, contact="",
         ended=True,
     )  # fmt: skip
 

@@ -184,6 +184,19 @@ def test_every_setpoint_keeps_the_limits_and_every_method_flies(method, worst_m,
     assert cross_track(trace, points).max() < worst_m
 
 
+def test_a_climb_that_is_off_its_line_goes_on_climbing():
+    """0.35 m aside, 0.1 m above the ground, pushed away by 0.25 m/s: the correction is all that it may be."""
+    z = np.arange(0.0, 2.01, 0.1)
+    points = np.stack([0 * z, 0 * z, z], axis=1)
+    node = TrackingNode(TrackingConfig())
+    list(node.handle(topics.TRAJECTORY, trajectory(points, ramp(points, 1.0) + 0.3 * (z < 0.05), stamp_ns=0)))
+    for n in range(60):
+        list(node.handle(topics.ODOMETRY, odometry([-0.35, 0.0, 0.1], [-0.25, 0.0, 0.0], stamp_ns=n * 20 * MS)))
+        list(node.handle(topics.SAFETY, word(stamp_ns=n * 20 * MS)))
+        (output,) = node.tick("control", n * 20 * MS)
+    assert output.message.v_odom[0] > 0.9 and output.message.v_odom[2] > 0.5
+
+
 @pytest.mark.parametrize("top", [1.5, 3.0])
 def test_the_end_is_not_overshot_without_wind(top):
     points = line(12.0)
