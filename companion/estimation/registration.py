@@ -7,6 +7,7 @@ residual test); weights after Cauchy.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Annotated
 
 import msgspec
@@ -166,9 +167,21 @@ def _find_planes(store, points, R, p, limits, planes, valid):  # type: ignore[no
     return used
 
 
+def _nearest_first() -> NDArray[np.int8]:
+    """The 27 voxels about a point, (27, 3): per axis 0 its own, 1 the one on the nearer side, 2 the other.
+
+    In the order of the squared distance to be expected, in quarters of a voxel: 0, 1 and 3 from the face.
+    """
+    away = (0, 1, 9)
+    return np.array(sorted(product(range(3), repeat=3), key=lambda v: sum(away[side] for side in v)), np.int8)
+
+
+_ORDER = _nearest_first()
+
+
 @njit(cache=True, nogil=True)
 def _nearest_five(store, x, voxel_m, near2, near):  # type: ignore[no-untyped-def]
-    """The 27 voxels around x, the centre first, skipping those that cannot hold a nearer point."""
+    """The 27 voxels around x, nearer ones first, skipping those that cannot hold a nearer point."""
     keys, value, counts, pool = store
     i0, j0, k0 = (
         np.int64(np.floor(x[0] / voxel_m)),
@@ -176,10 +189,15 @@ def _nearest_five(store, x, voxel_m, near2, near):  # type: ignore[no-untyped-de
         np.int64(np.floor(x[2] / voxel_m)),
     )
     gx, gy, gz = x[0] - i0 * voxel_m, x[1] - j0 * voxel_m, x[2] - k0 * voxel_m
+    si = -1 if 2.0 * gx < voxel_m else 1  # the nearer side
+    sj = -1 if 2.0 * gy < voxel_m else 1
+    sk = -1 if 2.0 * gz < voxel_m else 1
     found = 0
     for o in range(27):
-        cell = 13 if o == 0 else (o - 1 if o <= 13 else o)
-        di, dj, dk = cell % 3 - 1, (cell // 3) % 3 - 1, cell // 9 - 1
+        a, b, c = _ORDER[o, 0], _ORDER[o, 1], _ORDER[o, 2]
+        di = 0 if a == 0 else (si if a == 1 else -si)
+        dj = 0 if b == 0 else (sj if b == 1 else -sj)
+        dk = 0 if c == 0 else (sk if c == 1 else -sk)
         ex = 0.0 if di == 0 else (gx if di < 0 else voxel_m - gx)
         ey = 0.0 if dj == 0 else (gy if dj < 0 else voxel_m - gy)
         ez = 0.0 if dk == 0 else (gz if dk < 0 else voxel_m - gz)
