@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -31,7 +32,7 @@ WORLDS = {
 }
 COLUMNS = (
     "flight", "fault", "estimator", "ATE m", "drift %", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",
-    "in 3 sigma", "rank",
+    "in 3 sigma", "rank", "gap m",
 )  # fmt: skip
 
 
@@ -124,4 +125,5 @@ def cells(row: EstimationRow) -> list[str]:
     return [
         row.flight, row.fault, row.estimator, f"{row.ate_m:.3f}", f"{row.drift_percent:.3f}", f"{row.front_ms:.1f}",
         f"{row.all_ms:.1f}", *("" if x is None else f"{x:.2f}" for x in (*parts, row.covered, row.quality_rank)),
+        f"{np.median([g.error_m for g in row.gaps]):.3f}" if row.gaps else "",
     ]  # fmt: skip

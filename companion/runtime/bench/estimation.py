@@ -16,11 +16,13 @@ from companion.config import Config
 from companion.core.messages import Array
 from companion.core.rig import Rig
 from companion.runtime.bench.estimation_faults import fault
+from companion.runtime.bench.estimation_gaps import Gap, gaps_of
 from companion.runtime.bench.estimation_peers import Peer, peers
 from companion.runtime.bench.estimation_recording import heard, true_biases
 from companion.runtime.bench.estimation_replay import Run, feed
 from companion.runtime.bench.estimation_score import (
     Nees,
+    Truth,
     accuracy,
     estimates_of,
     nees_of,
@@ -48,6 +50,7 @@ class EstimationRow(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
     nees: Nees | None = None
     covered: float | None = None  # share of the time in which the position error is within three published sigmas
     quality_rank: float | None = None  # Spearman's, of published quality and accuracy
+    gaps: tuple[Gap, ...] = ()  # where the LiDAR was out
     why: tuple[str, ...] = ()  # what the nodes said
 
 
@@ -68,7 +71,9 @@ def own_row(run: Run, flight: str, fault_text: str, biases: tuple[Array, Array] 
     e = estimates_of(run)
     true = truth_at(run.truth, e.stamps_ns, R_first=e.R[0], p_first=e.p[0])
     found = accuracy(e.stamps_ns, e.R, e.p, run.truth)
-    covered, rank = _published(run, R_first=e.R[0], p_first=e.p[0])
+    stamps_ns = np.array([o.stamp_ns for o in run.odometry])
+    published = truth_at(run.truth, stamps_ns, R_first=e.R[0], p_first=e.p[0])
+    covered, rank = _published(run, published)
     return EstimationRow(
         flight=flight,
         fault=fault_text,
@@ -79,6 +84,7 @@ def own_row(run: Run, flight: str, fault_text: str, biases: tuple[Array, Array] 
         nees=nees_of(e, true, biases),
         covered=covered,
         quality_rank=rank,
+        gaps=gaps_of(run, published),
         why=tuple(f"{w.stamp_ns * 1e-9:.1f} s: {w.what}: {w.because}" for w in run.why),
     )
 
@@ -102,10 +108,8 @@ def peer_row(name: str, peer: Peer, run: Run, flight: str, rig: Rig) -> Estimati
     )
 
 
-def _published(run: Run, *, R_first: Array, p_first: Array) -> tuple[float, float]:
+def _published(run: Run, true: Truth) -> tuple[float, float]:
     """Of the odometry: share within three sigmas on every axis, and the rank of its quality."""
-    stamps = np.array([o.stamp_ns for o in run.odometry])
-    true = truth_at(run.truth, stamps, R_first=R_first, p_first=p_first)
     off = np.array([o.p_odom for o in run.odometry]) - true.p
     sigma = np.sqrt([o.pose_variance[3:] for o in run.odometry])
     quality = np.array([o.quality for o in run.odometry])

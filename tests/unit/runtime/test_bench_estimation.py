@@ -1,13 +1,17 @@
 """The bench of the estimators: its figures on errors that are known, and its faults."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from companion.core import topics
 from companion.core.errors import InputError
-from companion.core.messages import CameraImage, GroundTruth, ImuSample, LidarScan
+from companion.core.messages import CameraImage, GroundTruth, ImuSample, LidarScan, Odometry
 from companion.runtime.bench.estimation_faults import fault
+from companion.runtime.bench.estimation_gaps import gaps_of
+from companion.runtime.bench.estimation_replay import Run
 from companion.runtime.bench.estimation_score import (
     GRAVITY,
     Estimates,
@@ -103,3 +107,31 @@ def test_faults_do_what_their_names_say():
 def test_unknown_faults_are_named_with_what_is_valid(text):
     with pytest.raises(InputError, match="range_METRES"):
         fault(text)
+
+
+def gap_run(*, jump_m):
+    """20 s along x at 2 m/s, sweeps lost from 8 to 11 s; 0.3 m/s of error in y meanwhile, mended within 0.1 s."""
+    t = np.arange(0.0, 20.0, 0.01)
+    off = np.where((t > 8.0) & (t < 11.0), 0.3 * (t - 8.0), 0.0) + np.where(t >= 11.0, jump_m, 0.0)
+    p = np.column_stack([2.0 * t, off, 0 * t])
+    v = np.column_stack([0 * t + 2.0, np.where((t > 8.0) & (t < 11.0), 0.3, 0.0), 0 * t])
+    odometry = [
+        Odometry(
+            stamp_ns=round(s * 1e9), p_odom=a, q_odom_body=np.array([1.0, 0, 0, 0]), v_odom=b, omega_body=np.zeros(3),
+            pose_variance=np.full(6, 0.36**2), velocity_variance=np.ones(3), measured_ns=round(s * 1e9), quality=1.0,
+            reset_counter=0,
+        )
+        for s, a, b in zip(t, p, v, strict=True)
+    ]  # fmt: skip
+    sweeps = [SimpleNamespace(stamp_ns=round(s * 1e8), source="lidar") for s in range(200) if not 80 < s < 110]
+    truth = Truth(np.zeros((len(t), 3, 3)), np.column_stack([2.0 * t, 0 * t, 0 * t]), v, GRAVITY)
+    return Run(odometry=odometry, states=sweeps), truth
+
+
+def test_a_gap_is_found_in_what_was_used_and_measured_from_its_beginning():
+    (gap,) = gaps_of(*gap_run(jump_m=0.05))
+    assert (gap.at_s, gap.length_s) == (8.0, 3.0)
+    assert gap.error_m == pytest.approx(0.9, abs=0.01) and gap.later_m == pytest.approx(0.05, abs=1e-6)
+    assert gap.sigma_m == pytest.approx(0.36) and gap.covered  # 0.9 of 1.08
+    assert gap.step_m == pytest.approx(0.85, abs=0.02)  # back at once: odometry's one step
+    assert gaps_of(*gap_run(jump_m=-0.3))[0].later_m == pytest.approx(0.3, abs=1e-6)
