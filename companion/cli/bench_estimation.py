@@ -60,7 +60,7 @@ def estimation(
     for text in asked:
         fault(text)
     if with_peers and missing():
-        Console(stderr=True).print(f"no {', '.join(missing())}: pip install 'understory\[bench]'", style="dim")
+        Console(stderr=True).print(f"no {', '.join(missing())}: pip install 'understory\\[bench]'", style="dim")
     config, console = stack_config(None, tuple(set_ or ())), Console()
     plain = as_json or not console.is_terminal
     with tempfile.TemporaryDirectory() as scratch:

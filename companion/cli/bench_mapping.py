@@ -39,7 +39,7 @@ def mapping(
     """Measure the map beside OctoMap, edt and scipy. Example: companion bench mapping --rows insert_os64_0.2
 
     Peers and own code take turns in this process; times are CPU times. All rows take about half an hour.
-    The peers come with: pip install 'understory\[bench]'. JSON is also printed if standard output is no terminal.
+    The peers come with: the extra "bench" of the package. JSON is also printed if standard output is no terminal.
     """
     console, done = Console(), list[MappingRow]()
     plain = as_json or not console.is_terminal

@@ -31,7 +31,7 @@ def planning(
     """Measure our planners beside OMPL's on the same edges. Example: companion bench planning --worlds forest_25
 
     Planners take turns, run by run; times are CPU times. All worlds take about half an hour. OMPL comes with:
-    pip install 'understory\[bench]'. JSON is also printed if standard output is no terminal.
+    the extra "bench" of the package. JSON is also printed if standard output is no terminal.
     """
     for name in worlds or ():
         if name not in _VALID:

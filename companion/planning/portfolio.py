@@ -17,7 +17,6 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from companion.core.messages import Array
 from companion.planning.lazy_theta import COARSEST, NO_GUIDE, LazyTheta
 from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.reach import Reach
@@ -75,17 +74,14 @@ class Portfolio(Planner):
 
     def begin(self, query: Query) -> PortfolioSearch:
         """A search to be advanced in portions; it uses this planner's memory, so one at a time."""
-        ends = query.space.to_cells(np.stack([query.start, query.goal]))
-        return PortfolioSearch(self.config, self._rrt_star.begin(query), self._lattice, query.space, ends)
+        return PortfolioSearch(self.config, self._rrt_star.begin(query), self._lattice, query.space)
 
 
 class PortfolioSearch:
     """One run in rounds: `advance` until it is `infeasible`, or good enough."""
 
-    def __init__(
-        self, config: PortfolioConfig, tree: Search, lattice: LazyTheta, space: CellSpace, ends: Array
-    ) -> None:
-        self._config, self._tree, self._lattice, self._space, self._ends = config, tree, lattice, space, ends
+    def __init__(self, config: PortfolioConfig, tree: Search, lattice: LazyTheta, space: CellSpace) -> None:
+        self._config, self._tree, self._lattice, self._space, self._ends = config, tree, lattice, space, tree.ends
         self._levels = list(_LEVELS)
         self._looking = False
         self._reach: Reach | None = None

@@ -17,7 +17,7 @@ from companion.planning import connect as two_trees
 from companion.planning import grow, shortcut
 from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.polyline import length, without_repeats
-from companion.planning.tree import COST, NEVER, PARENT, way_to
+from companion.planning.tree import COST, NEVER, PARENT, drop_repeats, way_length, way_to
 from companion.planning.trees import FROM_GOAL, FROM_START, OWN, PATH_POINTS, Trees
 
 _SPARE_NODES = 2048  # for chains of known and shortened paths
@@ -104,9 +104,9 @@ class Search:
 
     def __init__(self, config: RRTStarConfig, space: CellSpace, memory: Trees, start: Array, goal: Array) -> None:
         self.config, self._space, self._memory = config, space, memory
-        self._ends = space.to_cells(np.stack([start, goal]))
+        self.ends = space.to_cells(np.stack([start, goal]))  # (2, 3)
         self._bucket = config.bucket_m / space.resolution_m
-        memory.plant(OWN, self._ends, self._bucket)
+        memory.plant(OWN, self.ends, self._bucket)
         self._tree = (memory.nodes[0], memory.links[0], memory.heads[0])
         self._counts = np.array([2, 0, grow.START])
         self._best, self._path = np.zeros((PATH_POINTS, 3)), memory.path
@@ -119,8 +119,8 @@ class Search:
 
     def take_known(self, path: Array) -> None:
         """Hang the valid beginning of a path into the tree; the rest become first samples."""
-        points = without_repeats(np.vstack([self._ends[:1], self._space.to_cells(path)]))
-        reach = np.vstack([points, self._ends[1:]])
+        points = without_repeats(np.vstack([self.ends[:1], self._space.to_cells(path)]))
+        reach = np.vstack([points, self.ends[1:]])
         chain = self._space.to_odom(reach)
         valid = 1
         while valid < len(chain) and self._space.segment_free(chain[valid - 1], chain[valid]):
@@ -165,7 +165,7 @@ class Search:
         """One chunk of samples for RRT*."""
         draws = rng.random((self.config.chunk, grow.DRAWS))
         if self._frame is None:
-            self._frame = np.vstack([_axes(self._ends[1] - self._ends[0]), self._ends.mean(axis=0)])
+            self._frame = np.vstack([_axes(self.ends[1] - self.ends[0]), self.ends.mean(axis=0)])
         rest = (self._counts, self._best, self._frame, self._box, draws, self._forced, self._settings())
         grow.grow(self._space.steps, *self._tree, *rest)
         self._forced = self._forced[:0]
@@ -188,7 +188,7 @@ class Search:
     def _shorten(self, count: int, rng: np.random.Generator, attempts: int) -> None:
         draws = rng.random((attempts, shortcut.DRAWS))
         count = shortcut.shorten(self._space.steps, self._path, count, draws)
-        if length(self._path[:count]) < self.best_cost - 1e-9:
+        if way_length(self._path, count) < self.best_cost - 1e-9:
             self._hang(self._path[:count])
             self._keep_if_better()
 
@@ -213,8 +213,8 @@ class Search:
         """One chunk of RRT-Connect; its first path is taken as it is, later ones if they are better once shortened."""
         memory, bucket = self._memory, self._bucket
         if self._pair is None:
-            memory.plant(FROM_START, self._ends[:1], bucket)
-            memory.plant(FROM_GOAL, self._ends[1:], bucket)
+            memory.plant(FROM_START, self.ends[:1], bucket)
+            memory.plant(FROM_GOAL, self.ends[1:], bucket)
             self._pair = np.array([1, 1])
         draws = rng.random((self.config.chunk, two_trees.DRAWS))
         step = self.config.step_m / self._space.resolution_m
@@ -227,7 +227,7 @@ class Search:
         if self.solved:
             self._shorten(count, rng, self.config.restart_shortcuts)
         else:
-            self._hang(without_repeats(self._path[:count]))
+            self._hang(self._path[: drop_repeats(self._path, count)])
             self._keep_if_better()
         return True
 
@@ -240,7 +240,7 @@ class Search:
             if count:
                 self._best[:count] = self._path[:count]
                 self._counts[grow.BEST] = count
-                self.best_cost = length(self._best[:count])
+                self.best_cost = float(way_length(self._best, count))
 
     def _way_to(self, node: int) -> int:
         return int(way_to(self._tree[0], self._tree[1], node, self._path))
@@ -249,7 +249,7 @@ class Search:
         """Node of the start's tree nearest to the goal."""
         assert self._pair is not None
         reached = self._memory.nodes[FROM_START, : self._pair[0], :3]
-        return int(np.argmin(np.linalg.norm(reached - self._ends[1], axis=1)))
+        return int(np.argmin(np.linalg.norm(reached - self.ends[1], axis=1)))
 
     def _settings(self) -> Array:
         """Numbers for `grow`; the neighbourhood shrinks with log(n)/n (Karaman and Frazzoli 2011)."""
@@ -257,7 +257,7 @@ class Search:
         n = int(self._counts[grow.NODES])
         volume = float(self._space.steps.size)
         if self.best_cost < NEVER:
-            c_min = float(np.linalg.norm(self._ends[1] - self._ends[0]))
+            c_min = float(np.linalg.norm(self.ends[1] - self.ends[0]))
             volume = min(volume, math.pi / 6.0 * self.best_cost * max(self.best_cost**2 - c_min**2, 1.0))
         gamma = config.radius_factor * 2.0 * (4.0 / 3.0 * volume / (4.0 / 3.0 * math.pi)) ** (1.0 / 3.0)
         radius = min(gamma * (math.log(n) / n) ** (1.0 / 3.0), config.step_m / cell)

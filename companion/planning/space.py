@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
+from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
@@ -166,7 +167,7 @@ class FieldSpace:
         low, high = (float(band[i, j] + 0.5) * self.resolution_m for band in self._bands[:2])
         return low + float(self.origin[2]), high + float(self.origin[2])
 
-    @property
+    @cached_property
     def sample_box(self) -> Array:
         """Corners (2, 3), in cells, of the box that holds all free cells: the band, map-wide."""
         nx, ny, _ = self.map.state.shape

@@ -22,6 +22,27 @@ def gap(a, m, b, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def way_length(points, count):  # type: ignore[no-untyped-def]
+    """Length of the polyline points[:count]."""
+    total = 0.0
+    for n in range(1, count):
+        total += gap(points, n, points, n - 1)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def drop_repeats(points, count):  # type: ignore[no-untyped-def]
+    """Leave out points[:count] that repeat the one before, in place; returns how many are left."""
+    kept = min(count, 1)
+    for n in range(1, count):
+        if gap(points, n, points, n - 1) > 1e-6:
+            for k in range(3):
+                points[kept, k] = points[n, k]
+            kept += 1
+    return kept
+
+
+@njit(cache=True, nogil=True)
 def add(nodes, links, head, node, before, bucket):  # type: ignore[no-untyped-def]
     """Node `node`, whose position is set, becomes a child of `before` (-1: a root)."""
     links[node, PARENT], links[node, CHILD], nodes[node, COST] = -1, -1, 0.0
