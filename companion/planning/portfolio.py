@@ -3,7 +3,8 @@
 A first way comes from RRT-Connect, which is fast where there is room. If a few samples do not find one, a wave from the
 goal finds the way around all walls, unless that is narrower than two cells. Then a flood fill says whether there is a
 way at all, and Lazy Theta* looks for it from coarse to fine, beside RRT-Connect. From then on RRT* and shortcuts better
-the way, and the lattices, which the wave guides, look for shorter ones elsewhere.
+the way, and the lattices, which the wave guides, look for shorter ones elsewhere. Where no wave was needed, detours
+past the other sides of what is in the way, and further ways of RRT-Connect, find the shortest side of each trunk.
 
 >>> planner = Portfolio(PortfolioConfig(), RRTStarConfig())
 >>> plan = planner.plan(start, goal, space, rng=np.random.default_rng(1), iterations=1000)
@@ -42,10 +43,16 @@ class PortfolioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """And per round beside RRT*, in worlds where a wave was needed for the first way."""
     easy_expansions: Count = 10
     """And in easy ones."""
-    restarts: Annotated[int, msgspec.Meta(ge=0)] = 4
+    restarts: Annotated[int, msgspec.Meta(ge=0)] = 2
     """Chunks of RRT-Connect that look for other first ways in easy worlds, before RRT* betters the best."""
+    restart_every: Count = 2
+    """One more of them in every so many rounds after that."""
     first_shortcuts: Count = 200
     """Attempts to shorten what RRT-Connect or the lattice found."""
+    detours: Annotated[int, msgspec.Meta(ge=0)] = 120
+    """Attempts per round, at most, to pass obstacles on their other side, in easy worlds."""
+    detour_m: Annotated[float, msgspec.Meta(gt=0)] = 30.0
+    """From this far before an obstacle, at most, to this far behind."""
     greed: Annotated[float, msgspec.Meta(ge=1)] = 3.0
     """Weight of the straight distance in the lattice while there is no way; then 1."""
 
@@ -89,7 +96,8 @@ class PortfolioSearch:
         self._is_swept = False  # was a wave sent?
         self._guide = NO_GUIDE
         self._is_new = True  # the first way is not shortened yet
-        self.samples = self._restarts = 0
+        self._detours = config.detours
+        self.samples = self._restarts = self._rounds = 0
 
     @property
     def solved(self) -> bool:
@@ -135,8 +143,20 @@ class PortfolioSearch:
             self._tree.join(rng)
             return
         self._look(config.guided_expansions if self._is_swept else config.easy_expansions, rng)
+        if not self._is_swept:
+            self._take_detours(rng)
+            self._rounds += 1
+            if self._rounds % config.restart_every == 0:
+                self._tree.join(rng)
         self._tree.grow(rng)
         self._tree.shorten(rng)
+
+    def _take_detours(self, rng: np.random.Generator) -> None:
+        """Half as many attempts, down to a few, after a round in which they were of no use."""
+        before = self.cost_m
+        self._tree.detour(rng, self._detours, reach_m=self._config.detour_m)
+        most = self._config.detours
+        self._detours = most if self.cost_m < before - 1e-6 else max(self._detours // 2, most // 8)
 
     def _sweep(self, rng: np.random.Generator) -> bool:
         """Once: the way down a wave of coarse blocks, if it comes to the start."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from companion.core.messages import Array
 from companion.planning import connect as two_trees
+from companion.planning import detour as other_side
 from companion.planning import grow, shortcut
 from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.polyline import length, without_repeats
@@ -177,6 +178,15 @@ class Search:
         if count > 2:
             self._path[:count] = self._best[:count]
             self._shorten(count, rng, self.config.shortcuts if attempts is None else attempts)
+
+    def detour(self, rng: np.random.Generator, attempts: int, *, reach_m: float) -> None:
+        """Try the other sides of what the best path bends about, then shorten it."""
+        count = int(self._counts[grow.BEST])
+        if count > 2:
+            self._path[:count] = self._best[:count]
+            draws = rng.random((attempts, other_side.DRAWS))
+            count = other_side.detour(self._space.steps, self._path, count, draws, reach_m / self._space.resolution_m)
+            self._shorten(count, rng, self.config.shortcuts)
 
     def offer(self, path: Array, rng: np.random.Generator, attempts: int) -> None:
         """A free path (N, 3) between the ends that another planner found: shorten it, take it if it is better."""
