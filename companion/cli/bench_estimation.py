@@ -46,7 +46,9 @@ def estimation(
     recordings: Annotated[Path | None, typer.Option(help="Where flights are kept and found again.")] = None,
     flight: Annotated[Path | None, typer.Option(help="A flight flown with --record instead.")] = None,
     with_peers: Annotated[bool, typer.Option("--peers/--no-peers", help="KISS-ICP and small_gicp, too.")] = True,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Override of the stack; repeatable.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override, sim.* of what is recorded, too; repeatable.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -62,9 +64,12 @@ def estimation(
     if with_peers and missing():
         Console(stderr=True).print(f"no {', '.join(missing())}: pip install 'understory\\[bench]'", style="dim")
     config, console = stack_config(None, tuple(set_ or ())), Console()
+    own = [o for o in set_ or () if o.startswith("sim.")]
     plain = as_json or not console.is_terminal
     with tempfile.TemporaryDirectory() as scratch:
-        folders = [(flight, flight.name)] if flight else _folders(courses, speeds, seeds, recordings or Path(scratch))
+        folders = (
+            [(flight, flight.name)] if flight else _folders(courses, speeds, seeds, recordings or Path(scratch), own)
+        )
         done = list(written(_rows(folders, asked, config, with_peers=with_peers), out=out, plain=plain))
     if not plain:
         console.print(estimation_table(done))
@@ -81,7 +86,7 @@ def _rows(
         yield from bench_flight(folder, name, faults, config, with_peers=with_peers)
 
 
-def _folders(courses: str, speeds: str, seeds: str, parent: Path) -> Iterator[tuple[Path, str]]:
+def _folders(courses: str, speeds: str, seeds: str, parent: Path, own: list[str]) -> Iterator[tuple[Path, str]]:
     """Folder and name of each flight; one that is not there is recorded now."""
     for course in courses.split(","):
         kind = one_of(course, ("forest", "clearing"), "--courses")
@@ -89,14 +94,14 @@ def _folders(courses: str, speeds: str, seeds: str, parent: Path) -> Iterator[tu
             for seed in _seeds(seeds):
                 folder = parent / f"{kind}_{speed:g}_{seed}"
                 if not (folder / LOG).is_file():
-                    _record(kind, speed, seed, folder)
+                    _record(kind, speed, seed, folder, own)
                 yield folder, folder.name
 
 
-def _record(kind: str, speed: float, seed: int, folder: Path) -> None:
+def _record(kind: str, speed: float, seed: int, folder: Path, own: list[str]) -> None:
     console = Console(stderr=True)
     console.print(f"recording {folder.name}", style="dim", highlight=False)
-    with open_simulator(WORLDS[kind], seed, GUSTS, 0, console) as sim:
+    with open_simulator(WORLDS[kind], seed, [*GUSTS, *own], 0, console) as sim:
         course = tour(sim.world.cones, top_m_s=speed, seed=seed) if kind == "forest" else ring(top_m_s=speed)
         record_course(course, folder, stack_config(None, ()), sim=sim.new_node(), mission=course_mission())
 
