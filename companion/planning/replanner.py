@@ -190,12 +190,12 @@ class Replanner:
     # --- parts of flying ---------------------------------------------------------------
 
     def _find(self, spaces: Spaces, kept: Commitment, goal: Goal, rng: np.random.Generator) -> Route | None:
-        """The goal or, where another place may stand for it, the nearest with all the clearance before less of that."""
-        known = kept.rest if len(kept.rest) else None
-        accept_m = goal.radius_m
-        if goal.if_blocked == "nearest_free":
-            accept_m = max(accept_m, self.config.route.substitute_m)
-        return self._finder.find(spaces, kept.head[-1], self._goal_odom, accept_m=accept_m, rng=rng, known_path=known)
+        """The goal or, where another may stand for it, the nearest place with all the clearance before less of that."""
+        known, before = kept.rest if len(kept.rest) else None, self._target if self._substitute else None
+        accept_m = max(goal.radius_m, self.config.route.substitute_m if goal.if_blocked == "nearest_free" else 0.0)
+        return self._finder.find(
+            spaces, kept.head[-1], self._goal_odom, accept_m=accept_m, rng=rng, known_path=known, before=before
+        )
 
     def _good(self, kept: Commitment, space: FieldSpace) -> bool:
         """Is the rest of the old way still as clear as it was planned, but for the slack?"""

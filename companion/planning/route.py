@@ -114,12 +114,17 @@ class RouteFinder:
         accept_m: float,
         rng: np.random.Generator,
         known_path: Array | None = None,
+        before: Array | None = None,
     ) -> Route | None:
-        """Route to within `accept_m` of the goal, or to the border of the map; None: not found."""
+        """Route to within `accept_m` of the goal, or to the border of the map; None: not found.
+
+        `before` is the place that stood for the goal so far, if it was not free.
+        """
         for space in spaces:
             self.proven = False
             escape = escape_from(start, space, within_m=self.config.escape_m)
-            place = place_for(goal, space, start, within_m=accept_m, margin_m=self.config.border_margin_m)
+            margin_m = self.config.border_margin_m
+            place = place_for(goal, space, start, within_m=accept_m, margin_m=margin_m, before=before)
             if escape is None or place is None:
                 continue
             target, at_border = place

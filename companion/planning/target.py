@@ -9,6 +9,8 @@ import numpy as np
 from companion.core.messages import Array, LocalMap
 from companion.planning.space import FieldSpace
 
+_FREE_M = 0.1  # a place this near is the goal
+_LITTLE_M = 0.5  # farther from the goal, and a place is still kept
 _BEARINGS_RAD = tuple(math.radians(d) for d in (0, 10, -10, 20, -20, 35, -35, 50, -50, 70, -70))
 
 
@@ -32,16 +34,19 @@ def at_height(p_odom: Array, agl_m: float, local_map: LocalMap, *, within_m: flo
 
 
 def place_for(
-    goal: Array, space: FieldSpace, start: Array, *, within_m: float, margin_m: float
+    goal: Array, space: FieldSpace, start: Array, *, within_m: float, margin_m: float, before: Array | None = None
 ) -> tuple[Array, bool] | None:
     """(free point to aim at, is it a substitute at the map's border); None: nothing free.
 
-    A goal inside the map gives the nearest free point within `within_m`. For one outside, the
-    border region is searched towards it, then to both sides.
+    A goal inside the map gives the nearest free point within `within_m`, or one beside the place aimed at `before`
+    that is little farther: of two on opposite sides of a trunk, now one and now the other is the nearest.
+    For a goal outside, the border region is searched towards it, then to both sides.
     """
     if space.contains(goal, margin_m=margin_m):
         place = _nearest_within_band(goal, space, within_m)
-        return None if place is None else (place, False)
+        if place is None:
+            return None
+        return place if before is None else _near_the_old(before, place, goal, space), False
     way = goal - start
     best: Array | None = None
     for bearing in _BEARINGS_RAD:
@@ -54,6 +59,13 @@ def place_for(
         if nearer:
             best = place
     return None if best is None else (best, True)
+
+
+def _near_the_old(before: Array, place: Array, goal: Array, space: FieldSpace) -> Array:
+    """The free place nearest to the one before, unless the goal itself is free or `place` is much nearer to it."""
+    off = float(np.linalg.norm(place - goal))
+    near = space.nearest_free(before, within_m=_LITTLE_M) if off > _FREE_M else None
+    return place if near is None or float(np.linalg.norm(near - goal)) > off + _LITTLE_M else near
 
 
 def _nearest_within_band(goal: Array, space: FieldSpace, within_m: float) -> Array | None:

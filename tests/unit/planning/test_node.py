@@ -101,6 +101,28 @@ def test_a_goal_in_a_trunk_becomes_the_nearest_free_place(flights, local_map):
     assert flight.clearance_m > 0.3
 
 
+def test_a_goal_in_a_trunk_keeps_its_place_although_maps_differ_by_a_voxel(flights, local_map):
+    """Seen so, the place nearest to the goal is on one side of the trunk, and seen so, on the other."""
+    goal, ends = [10.1, 6.1, 2.0], []
+    bench = Bench(flights, local_map, hall(), [3.0, 6.1, 2.0])
+    bench.goal(flights.goal_at(goal, blocked="nearest_free"))
+    for turn in range(6):
+        occupied = hall()
+        occupied[48:53, 30, :] = True
+        occupied[48:53, 31 if turn % 2 else 29, :] = True
+        bench.map = local_map(occupied, ground_z=0.1)
+        ends.append(bench.plan()[0].p_odom[-1])
+    fresh = [Bench(flights, local_map, hall(), [3.0, 6.1, 2.0]) for _ in range(2)]
+    for side, one in zip((29, 31), fresh, strict=True):
+        occupied = hall()
+        occupied[48:53, 30, :] = occupied[48:53, side, :] = True
+        one.map = local_map(occupied, ground_z=0.1)
+        one.goal(flights.goal_at(goal, blocked="nearest_free"))
+    apart = np.linalg.norm(np.subtract(*(one.plan()[0].p_odom[-1] for one in fresh)))
+    assert apart > 1.5  # two sides
+    assert np.linalg.norm(np.array(ends) - ends[0], axis=1).max() < 0.3
+
+
 def test_unknown_taken_for_blocked_waits_for_a_map_that_knows_how_far_it_is(flights, local_map):
     bench = Bench(flights, local_map, hall(), [2.0, 6.0, 2.0])
     told = bench.map
