@@ -42,6 +42,7 @@ class CompareConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     trunks: TrunkConfig = TrunkConfig()
     constellation: ConstellationConfig = ConstellationConfig()
     verify: VerifyConfig = VerifyConfig()
+    ground_cell_m: Positive = 1.0  # whose lowest points say how much higher one lies: trunks do not, odometry may drift
     reach_m: Positive = 13.0  # of the older one, that points of the newer must lie in to count: both saw it
     view: ViewConfig = ViewConfig()
     correlate: CorrelateConfig = CorrelateConfig()
@@ -108,11 +109,24 @@ def compare(old: Submap, new: Submap, expected: Array, gate_m: float) -> Match |
 def _by_trunks(old: Submap, new: Submap, place: Place, expected: tuple[Array, float]) -> Match | None:
     if np.linalg.norm(place.p_map - expected[0][:2]) > expected[1]:
         return None
-    guess = turn_z(place.yaw), np.array([*place.p_map, expected[0][2]])
-    placed = new.cloud @ guess[0].T.astype(np.float32) + guess[1].astype(np.float32)
-    both = new.cloud[np.einsum("ij,ij->i", placed, placed) < old.config.reach_m**2]
-    aligned = align(old.cloud, both, guess, old.config.verify)
-    return None if aligned is None else Match(aligned.R, aligned.p, place.inliers, aligned.near)
+    R, p = turn_z(place.yaw), np.array([*place.p_map, expected[0][2]])
+    p[2] += rise(old.cloud, _moved(new.cloud, R, p), cell_m=old.config.ground_cell_m)
+    if len(new.cloud) <= len(old.cloud):
+        aligned = _laid_on(old, new, (R, p))
+        return None if aligned is None else Match(aligned.R, aligned.p, place.inliers, aligned.near)
+    aligned = _laid_on(new, old, (R.T, -R.T @ p))
+    return None if aligned is None else Match(aligned.R.T, -aligned.R.T @ aligned.p, place.inliers, aligned.near)
+
+
+def _laid_on(more: Submap, less: Submap, guess: tuple[Array, Array]) -> Alignment | None:
+    """The one that saw less on the one that saw more, or half of it would meet nothing."""
+    placed = _moved(less.cloud, *guess)
+    both = less.cloud[np.einsum("ij,ij->i", placed, placed) < more.config.reach_m**2]
+    return align(more.cloud, both, guess, more.config.verify)
+
+
+def _moved(cloud: Array32, R: Array, p: Array) -> Array32:
+    return np.asarray(cloud @ R.T.astype(np.float32) + p.astype(np.float32))
 
 
 def _by_view(old: Submap, new: Submap, expected: Array, gate_m: float) -> Match | None:
@@ -148,6 +162,22 @@ def _apart(guesses: list[tuple[Array, float, float]]) -> list[tuple[Array, float
         if all(np.linalg.norm(p - other) > _ELSEWHERE_M for other, _ in kept):
             kept.append((p, yaw))
     return kept
+
+
+def rise(known: Array32, placed: Array32, *, cell_m: float) -> float:
+    """How far `placed` (M, 3) must rise for its ground to be that of `known` (N, 3), m: median over cells of both."""
+    low, other = _lowest(known, cell_m), _lowest(placed, cell_m)
+    gaps = [low[cell] - z for cell, z in other.items() if cell in low]
+    return float(np.median(gaps)) if gaps else 0.0
+
+
+def _lowest(points: Array32, cell_m: float) -> dict[int, float]:
+    """Lowest z by cell of the plane."""
+    at = np.floor(points[:, :2] / cell_m).astype(np.int64) + (1 << 20)
+    cells, inverse = np.unique(at[:, 0] << 32 | at[:, 1], return_inverse=True)
+    low = np.full(len(cells), np.inf)
+    np.minimum.at(low, inverse, points[:, 2].astype(np.float64))
+    return dict(zip(cells.tolist(), low.tolist(), strict=True))
 
 
 def turn_z(yaw: float) -> Array:

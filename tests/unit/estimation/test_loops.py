@@ -5,6 +5,7 @@ import pytest
 
 from companion.core.geometry import exp_so3, rotation_from_quaternion
 from companion.estimation.places.loops import LoopConfig, LoopFinder
+from companion.estimation.places.submap import rise
 from companion.estimation.places.verify import VerifyConfig, align
 from tests.unit.estimation.synthetic import cast
 
@@ -152,3 +153,19 @@ def test_clouds_align_from_a_rough_guess_and_strangers_do_not():
     assert found.p == pytest.approx(shift, abs=0.03)
     assert np.linalg.norm(found.R - turn_z(yaw)) < 0.01
     assert align(known, strange, (np.eye(3), np.zeros(3)), config) is None
+
+
+@pytest.mark.parametrize("rise_m", [-2.3, 0.0, 1.7])
+def test_the_ground_says_how_much_higher_a_cloud_lies(rise_m):
+    """Two sweeps of one slope with trunks, drawn anew: trunks and what one of them missed do not matter."""
+    rng = np.random.default_rng(3)
+
+    def cloud(n):
+        xy = rng.uniform(-12, 12, (n, 2))
+        ground = np.column_stack([xy, 0.05 * xy[:, 0] + rng.normal(0, 0.02, n)])
+        at = rng.integers(-10, 10, (n // 4, 2)) + 0.5
+        return np.vstack([ground, np.column_stack([at, rng.uniform(0, 4, n // 4)])]).astype(np.float32)
+
+    known, placed = cloud(6000), cloud(4000) - np.array([0, 0, rise_m], np.float32)
+    assert rise(known, placed, cell_m=1.0) == pytest.approx(rise_m, abs=0.05)
+    assert rise(known, placed + np.array([500, 0, 0], np.float32), cell_m=1.0) == 0.0  # nowhere the same
