@@ -38,7 +38,7 @@ def topics_page() -> str:
     rows = "\n".join(_topic_row(t) for t in topics.ALL)
     return f"""{HEAD}# Topics
 
-In the order of the data flow; messages are in `companion/core/messages.py`.
+In the order of the data flow; messages are in `companion/core/messages`.
 
 | topic | message | ROS 2 type | rate, Hz | service | a busy node gets | stored in the log | stale after, s |
 |---|---|---|---|---|---|---|---|
