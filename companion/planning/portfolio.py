@@ -27,6 +27,7 @@ from companion.planning.wave import Wave
 Count = Annotated[int, msgspec.Meta(ge=1)]
 _LEVELS = ((2, COARSEST), (1, COARSEST), (0, COARSEST), (0, 0))
 """Finest and coarsest lattice of the searches, one after the other; the last has every cell."""
+_FEW_SHORTCUTS = 20  # at once: most of what is gained is gained by looking straight on
 _BLOCK = 2  # cells; blocks that are free as a whole carry the wave
 _WAVE_SHARE = 0.94  # of a wave's layers: at most the distance
 _ROOM_COLUMNS = 4000  # columns of a small room, counted each time that it spreads
@@ -95,7 +96,7 @@ class PortfolioSearch:
         self._joined: bool | None = None  # do free cells lead to the goal? None: not known yet
         self._is_swept = False  # was a wave sent?
         self._guide = NO_GUIDE
-        self._is_new = True  # the first way is not shortened yet
+        self._early = [_FEW_SHORTCUTS, config.first_shortcuts]  # attempts to shorten the first way, round by round
         self._detours = config.detours
         self.samples = self._restarts = self._rounds = 0
 
@@ -133,9 +134,8 @@ class PortfolioSearch:
             self._look(config.hard_expansions, rng)
 
     def _better(self, rng: np.random.Generator) -> None:
-        if self._is_new:
-            self._is_new = False
-            self._tree.shorten(rng, self._config.first_shortcuts)
+        if self._early:
+            self._tree.shorten(rng, self._early.pop(0))
             return
         config = self._config
         if not self._is_swept and self._restarts < config.restarts:
