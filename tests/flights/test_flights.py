@@ -89,7 +89,7 @@ walker_speed_m_s: [1.2, 1.2]
 
 
 def test_where_somebody_walks_through_a_hovering_vehicle_it_steps_aside_and_comes_back(fly, tmp_path):
-    """The walker passes the place every 10 s, at most; it is not there, and has left no ghost, when the vehicle comes."""
+    """The walker passes the place every 10 s, at most; it is elsewhere when the vehicle comes."""
     world = tmp_path / "crossed.yaml"
     world.write_text(CROSSED)
     flight = fly(
