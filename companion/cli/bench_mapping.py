@@ -36,10 +36,10 @@ def mapping(
     out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Measure the map beside OctoMap, edt and scipy. Example: companion bench mapping --rows insert_os64_0.2
+    r"""Measure the map beside OctoMap, edt and scipy. Example: companion bench mapping --rows insert_os64_0.2
 
     Peers and own code take turns in this process; times are CPU times. All rows take about half an hour.
-    The peers come with: the extra "bench" of the package. JSON is also printed if standard output is no terminal.
+    The peers come with: pip install 'understory\[bench]'. JSON is also printed if standard output is no terminal.
     """
     console, done = Console(), list[MappingRow]()
     plain = as_json or not console.is_terminal

@@ -28,10 +28,10 @@ def planning(
     out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Measure our planners beside OMPL's on the same edges. Example: companion bench planning --worlds forest_25
+    r"""Measure our planners beside OMPL's on the same edges. Example: companion bench planning --worlds forest_25
 
     Planners take turns, run by run; times are CPU times. All worlds take about half an hour. OMPL comes with:
-    the extra "bench" of the package. JSON is also printed if standard output is no terminal.
+    pip install 'understory\[bench]'. JSON is also printed if standard output is no terminal.
     """
     for name in worlds or ():
         if name not in _VALID:

@@ -7,9 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from companion.core.correction import Correction
 from companion.core.geometry import wrap_angle
 from companion.core.messages import PROVEN, Array, Goal, Limits, PlanStatus, freeze
-from companion.mission.placing import Correction, Places
+from companion.mission.placing import Places
 from companion.mission.route import Leg
 from companion.mission.schema import AnyStep
 

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from companion.core.correction import Correction
 from companion.core.messages import MissionStatus, Odometry, PlanStatus, VehicleStatus, Why
 from companion.core.node import Output
 from companion.core.topics import GOAL, MISSION, VEHICLE_COMMAND, WHY
@@ -15,7 +16,6 @@ from companion.mission.config import MissionConfig
 from companion.mission.estimate import estimate
 from companion.mission.inputs import Inputs
 from companion.mission.legs import Run, stop_goal
-from companion.mission.placing import Correction
 from companion.mission.schema import Mission, set_or
 
 Outputs = Iterator[Output]

@@ -5,46 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
+from companion.core.correction import Correction
 from companion.core.geometry import (
-    IDENTITY_Q,
-    quaternion_conjugate,
     quaternion_from_yaw,
     rotate,
     wrap_angle,
     yaw_of,
 )
-from companion.core.messages import Array, Odometry, SmoothedState
+from companion.core.messages import Array, Odometry
 from companion.mission.route import TURN_RAD, Leg
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Correction:
-    """Where odom's origin and axes lie in map."""
-
-    p_map_odom: Array  # (3,)
-    q_map_odom: Array  # wxyz, (4,)
-
-    @classmethod
-    def newest(cls, smoothed: SmoothedState | None) -> Correction:
-        """From the graph's newest state; the identity before the first."""
-        if smoothed is None:
-            return cls(p_map_odom=np.zeros(3), q_map_odom=IDENTITY_Q)
-        return cls(p_map_odom=smoothed.p_map_odom, q_map_odom=smoothed.q_map_odom)
-
-    @property
-    def yaw(self) -> float:
-        """Heading of odom's x in map, rad."""
-        return yaw_of(self.q_map_odom)
-
-    def to_map(self, p_odom: Array) -> Array:
-        """Points (..., 3), odom -> map."""
-        return rotate(self.q_map_odom, p_odom) + self.p_map_odom
-
-    def to_odom(self, p_map: Array) -> Array:
-        """Points (..., 3), map -> odom."""
-        return rotate(quaternion_conjugate(self.q_map_odom), p_map - self.p_map_odom)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

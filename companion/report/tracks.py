@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from companion.core import topics
-from companion.core.geometry import quaternion_multiply, rotate
+from companion.core.correction import Correction
+from companion.core.geometry import quaternion_multiply
 from companion.core.messages import (
     Array,
     GroundTruth,
@@ -17,7 +18,6 @@ from companion.core.messages import (
     Odometry,
     PlanStatus,
     SafetyStatus,
-    SmoothedState,
     Why,
 )
 from companion.core.node import Topic
@@ -35,7 +35,7 @@ class Tracks:
     safety: list[SafetyStatus] = field(default_factory=list)
     why: list[Why] = field(default_factory=list)
     poses_map: list[MapPose] = field(default_factory=list)  # of each odometry, as odom then lay in map
-    _smoothed: SmoothedState | None = None
+    _odom: Correction = field(default_factory=lambda: Correction.newest(None))
 
     def heard(self, topic: Topic[Any], message: Any) -> None:
         """Keep what the report needs."""
@@ -50,9 +50,9 @@ class Tracks:
         if topic.name in lists:
             lists[topic.name].append(message)
         if topic is topics.SMOOTHED:
-            self._smoothed = message
+            self._odom = Correction.newest(message)
         elif topic is topics.ODOMETRY:
-            self.poses_map.append(_in_map(message, self._smoothed))
+            self.poses_map.append(_in_map(message, self._odom))
 
     def true_track(self) -> Track:
         """Where the vehicle was, in the world."""
@@ -76,12 +76,9 @@ class MapPose:
     q_map_body: Array  # wxyz, (4,)
 
 
-def _in_map(odometry: Odometry, smoothed: SmoothedState | None) -> MapPose:
-    if smoothed is None:
-        return MapPose(odometry.stamp_ns, odometry.p_odom, odometry.q_odom_body)
-    q = smoothed.q_map_odom
-    p_map = rotate(q, odometry.p_odom) + smoothed.p_map_odom
-    return MapPose(odometry.stamp_ns, p_map, quaternion_multiply(q, odometry.q_odom_body))
+def _in_map(odometry: Odometry, odom: Correction) -> MapPose:
+    q_map_body = quaternion_multiply(odom.q_map_odom, odometry.q_odom_body)
+    return MapPose(odometry.stamp_ns, odom.to_map(odometry.p_odom), q_map_body)
 
 
 @dataclass(frozen=True, slots=True)

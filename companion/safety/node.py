@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from companion.core import topics
+from companion.core.correction import Correction
 from companion.core.fence import Fence
-from companion.core.geometry import rotate
 from companion.core.messages import (
     Array,
     LioState,
@@ -140,9 +140,7 @@ class SafetyNode(Node):
 
     def _p_map(self) -> Array:
         assert self._odometry is not None
-        if self._smoothed is None:
-            return self._odometry.p_odom
-        return rotate(self._smoothed.q_map_odom, self._odometry.p_odom) + self._smoothed.p_map_odom
+        return Correction.newest(self._smoothed).to_map(self._odometry.p_odom)
 
     def _fence_depth_m(self) -> float:
         if self._fence is None or self._p_map_home is None:

@@ -43,7 +43,7 @@ class CompareConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     constellation: ConstellationConfig = ConstellationConfig()
     verify: VerifyConfig = VerifyConfig()
     ground_cell_m: Positive = 1.0  # whose lowest points say how much higher one lies: trunks do not, odometry may drift
-    reach_m: Positive = 13.0  # of the older one, that points of the newer must lie in to count: both saw it
+    reach_m: Positive = 13.0  # of the one that saw more, that points of the other must lie in to count: both saw it
     view: ViewConfig = ViewConfig()
     correlate: CorrelateConfig = CorrelateConfig()
     view_verify: VerifyConfig = VerifyConfig(near_m=0.2, least_near=0.85, settled_m=5e-3, iterations=20)

@@ -41,13 +41,12 @@ def gaps_of(run: Run, true: Truth) -> tuple[Gap, ...]:
 
 
 def _gap(begin_ns: int, end_ns: int, stamps: Array, off: Array, steps: Array, odometry: list[Odometry]) -> Gap:
-    zero, before, last, later = np.searchsorted(
-        stamps, [stamps[0], begin_ns, end_ns, end_ns + _LATER_S * 1e9]
-    ) - np.array([0, 0, 1, 0])
+    before, back, later = np.searchsorted(stamps, [begin_ns, end_ns, end_ns + _LATER_S * 1e9])
+    last = back - 1
     change = off[last] - off[before]
     sigma = np.sqrt(odometry[last].pose_variance[3:])
     return Gap(
-        at_s=round(float(begin_ns - stamps[zero]) * 1e-9, 2),
+        at_s=round(float(begin_ns - stamps[0]) * 1e-9, 2),
         length_s=round(float(end_ns - begin_ns) * 1e-9, 2),
         error_m=float(np.linalg.norm(change)),
         sigma_m=float(sigma.max()),

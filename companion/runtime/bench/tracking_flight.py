@@ -13,11 +13,11 @@ import msgspec
 import numpy as np
 
 from companion.core import topics
+from companion.core.correction import Correction
 from companion.core.errors import CompanionError
 from companion.core.geometry import quaternion_from_yaw, rotation_from_quaternion, yaw_of
 from companion.core.messages import Array, GroundTruth, Odometry, Setpoint
 from companion.core.node import Node, Topic
-from companion.mission.placing import Correction
 from companion.runtime.bench.tracking_pilot import Course, PilotNode
 from companion.runtime.lockstep import Lockstep
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.core import topics
+from companion.core.correction import Correction
 from companion.core.geometry import wrap_angle, yaw_of
 from companion.core.messages import (
     Array,
@@ -24,12 +25,12 @@ from companion.core.messages import (
     VehicleStatus,
 )
 from companion.core.node import Node, Outputs, every, on
-from companion.mission.placing import Correction
 from companion.mission.route import LEG_M, TURN_RAD
+from companion.planning.config import PlanningConfig
 
 _CLIMB_M_S, _CLIMB_ACCEL = 1.0, 1.0
 _CALM_S = 1.5  # hovering before the path begins, and after it has ended
-_TURN_ABOVE_M = 0.5
+_TURN_ABOVE_M = PlanningConfig().turn_above_m
 _CLIMB_S = 8.0  # to the start of the path and for the autopilot's integrals to settle
 
 
