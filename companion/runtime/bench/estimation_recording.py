@@ -81,7 +81,7 @@ def record_course(course: Course, folder: Path, config: Config, *, sim: Node, mi
     """
     folder.mkdir(parents=True, exist_ok=True)
     kinds = (TrackingNode, AutopilotNode)
-    pilot = PilotNode(course)
+    pilot = PilotNode(course, turns=True)
     nodes = [sim, TrueOdometryNode(), *build(config, mission, seed=0, only=kinds), pilot]
     tape = _Tape(folder / f"{LOG}.part", sim)  # type: ignore[arg-type]
     delays = {n: {k: round(v * 1e6) for k, v in d.items()} for n, d in config.lockstep.delay_ms.items()}

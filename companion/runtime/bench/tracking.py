@@ -70,7 +70,7 @@ def fly(course: Course, config: Config, *, estimate: Estimate, sim: Node, missio
     kinds = (*_ESTIMATORS, TrackingNode, AutopilotNode) if own else (TrackingNode, AutopilotNode)
     nodes = [*([] if own else [TrueOdometryNode()]), *build(config, mission, seed=0, only=kinds)]
     delays = {n: {k: round(v * 1e6) for k, v in d.items()} for n, d in config.lockstep.delay_ms.items()}
-    return fly_course([sim, *nodes], PilotNode(course), delays_ns=delays)
+    return fly_course([sim, *nodes], PilotNode(course, turns=own), delays_ns=delays)
 
 
 def with_method(config: Config, method: Method) -> Config:

@@ -1,6 +1,6 @@
 """One measured flight along a course, in lockstep, and what it came to.
 
-flown = fly_course(nodes, PilotNode(course), delays_ns=delays)
+flown = fly_course(nodes, PilotNode(course, turns=True), delays_ns=delays)
 print(score(flown).rmse_m)
 """
 

@@ -56,14 +56,15 @@ class Course:
 class PilotNode(Node):
     """Says what planner, mission and guards would; `begun_ns` is when the path was first sent.
 
-    As in a mission, the vehicle turns half round as it climbs, and the path, which lies in map, is carried over into
-    odom anew every `LEG_M` of the way.
+    As in a mission the path, which lies in map, is carried over into odom anew every `LEG_M` of the way. With `turns`
+    the vehicle turns about as it climbs, which estimators are the better for; where the truth stands in for them
+    it would only begin the path with its back to it.
     """
 
     publishes = (topics.TRAJECTORY, topics.SAFETY, topics.VEHICLE_COMMAND)
 
-    def __init__(self, course: Course) -> None:
-        self.course = course
+    def __init__(self, course: Course, *, turns: bool) -> None:
+        self.course, self._turns = course, turns
         self.begun_ns: int | None = None
         self.done = False
         self._odometry: Odometry | None = None
@@ -115,7 +116,8 @@ class PilotNode(Node):
     def _path(self, now_ns: int) -> Trajectory:
         assert self._odometry is not None
         if self._up_ns is None:
-            self._up_ns, self._turned = now_ns, wrap_angle(yaw_of(self._odometry.q_odom_body) + TURN_RAD)
+            self._up_ns = now_ns
+            self._turned = wrap_angle(yaw_of(self._odometry.q_odom_body) + TURN_RAD) if self._turns else math.nan
         points, speeds, accel = self._up
         yaw = self._turned if self._odometry.p_odom[2] > _TURN_ABOVE_M else math.nan
         if now_ns - self._up_ns > _CLIMB_S * 1e9:
