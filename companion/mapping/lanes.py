@@ -15,42 +15,53 @@ from numba.extending import intrinsic
 
 LANES = 16
 FRACTION = 20  # bits after the point, so 12 before it: grids of up to 4096 voxels
+_DOUBT = (1 << FRACTION) - LANES  # these bits all set: LANES units more carry over into the whole part
+_INSIDE = 3  # bits of a voxel's place in its block; what stands above them is the block's
+_CELLS = 9  # bits of an index inside a block
+_NARROW = 0x7FFF  # LLVM multiplies what it knows to fit 16 bits in one step instead of two
 _unpack: Any = cgutils.unpack_tuple
 _I32 = ir.IntType(32)
 _LANES = ir.VectorType(_I32, LANES)
 
 
-def _write_indices(typing: Any, row: Any, first: Any, now: Any, u: Any, v: Any, w: Any) -> Any:
-    """write_indices(row, first, now, u, v, w) -> bits of the lanes that may be wrong, which is rare.
+def _write_indices(typing: Any, row: Any, first: Any, now: Any, u: Any, v: Any, along: Any, place: Any) -> Any:
+    """write_indices(row, first, now, u, v, along, place) -> bits of the lanes that may be wrong, which is rare.
 
-    `now` are the places along three axes, each axis is (step, stride, block stride), uint32; u and v are
-    fixed point cut off below, w is whole. row[first + j] becomes the sum over the axes of
-    x * stride + (x >> 3) * block stride, with x = now + j * step. Cutting off puts lane j at most j + 1
-    units too low: it may be wrong if LANES units more give another voxel.
+    row[first + j] becomes the index of the voxel j planes on: along[place + j], which is the share of the axis
+    whose planes are counted, plus those of u and v. `now` are the places along these, fixed point cut off
+    below, and each is (step, bit of a voxel inside a block, blocks from one to the next along it), uint32; v's
+    blocks fit 15 bits. Cutting off puts lane j at most j + 1 units too low: it may be wrong if LANES units
+    more give another voxel.
     """
-    return types.uint64(row, first, now, u, v, w), _emit
+    return types.uint64(row, first, now, u, v, along, place), _emit
 
 
 write_indices: Any = intrinsic(_write_indices)
 
 
 def _emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-    row, first, now, *axes = args
-    data = context.make_array(signature.args[0])(context, builder, row).data
-    total, doubt = ir.Constant(_LANES, None), None
-    starts = _unpack(builder, now, 3)
-    for start, axis, fixed in zip(starts, axes, (True, True, False), strict=True):
-        step, stride, block_stride = (_splat(builder, a) for a in _unpack(builder, axis, 3))
+    row, first, now, u, v, along, place = args
+    table = context.make_array(signature.args[5])(context, builder, along).data
+    inside = builder.load(_at(builder, table, place), align=4)
+    blocks, doubt = None, None
+    for start, axis in zip(_unpack(builder, now, 2), (u, v), strict=True):
+        step, bit, apart = (_splat(builder, a) for a in _unpack(builder, axis, 3))
         lane = ir.Constant(_LANES, list(range(LANES)))
         x = builder.add(_splat(builder, start), builder.mul(lane, step))
-        if fixed:
-            x, more = (builder.lshr(at, _all(FRACTION)) for at in (x, builder.add(x, _all(LANES))))
-            differs = builder.icmp_unsigned("!=", x, more)
-            doubt = differs if doubt is None else builder.or_(doubt, differs)
-        blocks = builder.mul(builder.lshr(x, _all(3)), block_stride)
-        total = builder.add(total, builder.add(builder.mul(x, stride), blocks))
-    builder.store(total, builder.bitcast(builder.gep(data, [first]), _LANES.as_pointer()), align=4)
+        unsure = builder.icmp_unsigned("==", builder.and_(x, _all(_DOUBT)), _all(_DOUBT))
+        cell = builder.lshr(x, builder.and_(builder.sub(_all(FRACTION), bit), _all(31)))
+        inside = builder.add(inside, builder.and_(cell, builder.shl(_all((1 << _INSIDE) - 1), bit)))
+        apart = builder.and_(apart, _all(_NARROW)) if axis is v else apart
+        away = builder.mul(builder.lshr(x, _all(FRACTION + _INSIDE)), apart)
+        blocks, doubt = (away, unsure) if blocks is None else (builder.add(blocks, away), builder.or_(doubt, unsure))
+    total = builder.add(inside, builder.shl(blocks, _all(_CELLS)))
+    data = context.make_array(signature.args[0])(context, builder, row).data
+    builder.store(total, _at(builder, data, first), align=4)
     return builder.zext(builder.bitcast(doubt, ir.IntType(LANES)), ir.IntType(64))
+
+
+def _at(builder: Any, data: Any, place: Any) -> Any:
+    return builder.bitcast(builder.gep(data, [place]), _LANES.as_pointer())
 
 
 def _all(value: int) -> Any:
