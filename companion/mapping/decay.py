@@ -11,6 +11,9 @@ unknown, whether or not rays come by: one look makes them free. Where rays have 
 others, the evidence for these is cut to even odds, so that the next look decides. Nothing else
 decays: a branch loses a cell or two at a time, what walks leaves many.
 
+Where a track of something that moves has just been (`companion.mapping.walked`) no crowd is needed,
+and nothing becomes proven: a slow walker is hit twice in the same cell.
+
 A cell that was forgotten and is hit again comes from unknown, so it is no newcomer: evidence of
 something that stays is lost once at most. In a loaded map only newcomers go, and back to free.
 """
@@ -25,11 +28,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.core.errors import InputError
+from companion.core.messages import Array, ObstacleTracks
 from companion.mapping.blocks import BlockStore
 from companion.mapping.marks import CAME, FRESH, MISSED, PROVEN, QUIET, STILL
 from companion.mapping.rays import CELLS, WORDS
 from companion.mapping.sensor_model import UNKNOWN
 from companion.mapping.voxel_map import VoxelMap
+from companion.mapping.walked import NOBODY, Walked, walked_cells
 
 u64 = np.uint64
 _PART = 4  # so much smaller is what of a crowd may stand in the next block
@@ -43,6 +48,7 @@ class DecayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     period_s: Annotated[float, msgspec.Meta(ge=0.1, le=10.0)] = 0.4  # between passes; three without a hit are stale
     crowd: Annotated[int, msgspec.Meta(ge=1, le=512)] = 16  # stale cells in a block below which none decays
     forget_unseen_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0  # blocks no ray met for so long go; 0: they stay
+    walked_s: Annotated[float, msgspec.Meta(ge=0.0, le=10.0)] = 3.0  # for so long a place is one where something moved
     erase_loaded: bool = False  # whether a loaded map decays like any other
 
 
@@ -56,7 +62,12 @@ class Decay:
 
     def __init__(self, config: DecayConfig) -> None:
         self.config = config
+        self._walked = Walked(config.walked_s)
         self._passed_ns: int | None = None
+
+    def take(self, tracks: ObstacleTracks) -> None:
+        """Note where things that move are."""
+        self._walked.take(tracks)
 
     def after_scan(self, voxels: VoxelMap, stamp_ns: int) -> NDArray[np.int32]:
         """A pass if one is due; positions (K, 3) of the blocks in which a cell changed its class."""
@@ -65,11 +76,14 @@ class Decay:
         if not self.config.on or stamp_ns - since_ns < period_ns:
             return np.empty((0, 3), np.int32)
         self._passed_ns = stamp_ns
-        return decay(voxels, stamp_ns, self.config, since_ns=since_ns)
+        cylinders = self._walked.cylinders(stamp_ns, voxels.resolution_m)
+        return decay(voxels, stamp_ns, self.config, since_ns=since_ns, cylinders=cylinders)
 
 
-def decay(voxels: VoxelMap, now_ns: int, config: DecayConfig, *, since_ns: int) -> NDArray[np.int32]:
-    """One pass at `now_ns`; the last one was at `since_ns`.
+def decay(
+    voxels: VoxelMap, now_ns: int, config: DecayConfig, *, since_ns: int, cylinders: Array = NOBODY
+) -> NDArray[np.int32]:
+    """One pass at `now_ns`; the last one was at `since_ns`; `cylinders` (K, 5) say where something moved.
 
     Returns the positions (K, 3) of the blocks in which a cell changed its class. Raises InputError
     when the map was not made for it.
@@ -80,10 +94,10 @@ def decay(voxels: VoxelMap, now_ns: int, config: DecayConfig, *, since_ns: int) 
     rows = np.flatnonzero(blocks.stirred[: blocks.count])
     changed = np.zeros(len(rows), np.bool_)
     kept = blocks.held if not config.erase_loaded else np.zeros_like(blocks.held)
-    newcomers = np.zeros(len(rows), np.int64)
-    _count_newcomers(rows, blocks.marks, blocks.log_odds, newcomers)
+    newcomers, walked = np.zeros(len(rows), np.int64), walked_cells(blocks.xyz[rows], cylinders)
+    _count_newcomers(rows, blocks.marks, blocks.log_odds, walked, newcomers)
     crowded = _crowded(blocks, rows, newcomers, config.crowd)
-    _pass(rows, blocks.marks, (blocks.log_odds, kept), (config.crowd, crowded), changed)
+    _pass(rows, blocks.marks, (blocks.log_odds, kept), (config.crowd, crowded, walked), changed)
     rows = rows[changed]
     if config.forget_unseen_s > 0.0:
         rows = np.concatenate([rows, _forget_unseen(voxels, now_ns, since_ns, config)])
@@ -118,20 +132,20 @@ def _crowded(
 
 
 @njit(cache=True, nogil=True)
-def _count_newcomers(rows, marked, log_odds, newcomers):  # type: ignore[no-untyped-def]
+def _count_newcomers(rows, marked, log_odds, walked, newcomers):  # type: ignore[no-untyped-def]
     _, slots, _, (bits, _, _) = marked
     gone, weak = np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64)
     for n in range(rows.size):
         slot = slots[rows[n]]
         octets = log_odds[rows[n]].view(np.uint64)
         for w in range(WORDS if slot != 0 else 0):
-            newcomers[n] += _judge(bits[slot], w, _occupied(octets, w), gone, weak)
+            newcomers[n] += _judge(bits[slot], w, _occupied(octets, w), walked[n, w], (gone, weak))
 
 
 @njit(cache=True, nogil=True)
 def _pass(rows, marked, cells, crowds, changed):  # type: ignore[no-untyped-def]
     (_, slots, stirred, (bits, free, left)), (log_odds, held) = marked, cells
-    crowd, crowded = crowds
+    crowd, crowded, walked = crowds
     gone, weak, occupied = np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64)
     for n in range(rows.size):
         stirred[rows[n]] -= 1
@@ -143,14 +157,16 @@ def _pass(rows, marked, cells, crowds, changed):  # type: ignore[no-untyped-def]
         passed = 0
         for w in range(WORDS):
             occupied[w] = _occupied(octets, w)
-            _judge(marks, w, occupied[w], gone, weak)
+            _judge(marks, w, occupied[w], walked[n, w], (gone, weak))
             passed += _count(weak[w])
-        if not crowded[n]:
-            gone[:] = u64(0)
-        if passed < crowd or keep:
-            weak[:] = u64(0)
         left_over = u64(0)
         for w in range(WORDS):
+            if not crowded[n]:
+                gone[w] &= walked[n, w]
+            if keep:
+                weak[w] = u64(0)
+            elif passed < crowd:
+                weak[w] &= walked[n, w]
             if gone[w] | weak[w] != u64(0):
                 _lower(levels, 64 * w, (gone[w], weak[w]), keep)
                 changed[n] |= gone[w] != u64(0)
@@ -163,9 +179,10 @@ def _pass(rows, marked, cells, crowds, changed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _judge(marks, w, occupied, gone, weak):  # type: ignore[no-untyped-def]
+def _judge(marks, w, occupied, walked, found):  # type: ignore[no-untyped-def]
     """Newcomers among 64 cells, their number; the stale ones of them, and other stale ones that rays passed."""
-    marks[PROVEN, w] |= marks[STILL, w] & marks[FRESH, w]
+    gone, weak = found
+    marks[PROVEN, w] |= marks[STILL, w] & marks[FRESH, w] & ~walked
     open_ = occupied & ~marks[PROVEN, w]
     stale = open_ & marks[STILL, w] & ~marks[FRESH, w]
     gone[w] = stale & marks[CAME, w]

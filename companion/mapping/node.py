@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from companion.core.geometry import rotation_from_quaternion
-from companion.core.messages import Array, Goal, MapStatus, PoseCorrections, RegisteredScan, Why
+from companion.core.messages import Array, Goal, MapStatus, ObstacleTracks, PoseCorrections, RegisteredScan, Why
 from companion.core.node import Node, Outputs, on
 from companion.core.rig import Rig
 from companion.core.topics import (
@@ -18,6 +18,7 @@ from companion.core.topics import (
     MAP_DELTA,
     MAP_FULL,
     MAP_STATUS,
+    OBSTACLE_TRACKS,
     OCCUPIED,
     REGISTERED,
     WHY,
@@ -108,6 +109,11 @@ class MappingNode(Node):
             yield MAP_STATUS(self._status(scan.stamp_ns))
         self.scans += 1
         yield from self._share.after_scan(self.voxels, scan.p_odom, stamp_ns=scan.stamp_ns)
+
+    @on(OBSTACLE_TRACKS)
+    def walked(self, tracks: ObstacleTracks) -> None:
+        """What stands where something moved is its ghost, unless it was proven before."""
+        self._decay.take(tracks)
 
     @on(CORRECTIONS)
     def correct(self, corrections: PoseCorrections) -> None:

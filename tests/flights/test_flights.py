@@ -96,7 +96,6 @@ def test_where_somebody_walks_through_a_hovering_vehicle_it_steps_aside_and_come
         """
 steps:
   - {do: takeoff, alt: 2.0}
-  - {do: hover, seconds: 3}
   - {do: goto, at: [5, 0, 2], alt_ref: agl}
   - {do: hover, seconds: 14}
   - {do: land}

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from companion.core.errors import InputError
+from companion.core.messages import ObstacleTracks
 from companion.core.rig import Rig
 from companion.mapping.decay import Decay, DecayConfig, decay
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from companion.mapping.walked import walked_cells
 from sim.sensors.caster import Caster
 from sim.sensors.lidar import Lidar, LidarConfig
 from sim.world import load_world
@@ -86,6 +90,72 @@ def test_few_cells_do_not_decay_and_many_do():
     for cells, state in ((3, 2), (4, 0)):
         m = Mapper().see(WALL, 12).see(FRONT[:cells], 8).see([[-5.0, 0.0, 0.0]], 30)
         assert m.classes(FRONT[:cells]) == [state]
+
+
+def walks_at(x, y, *, speed=1.0, stamp_ns=0):
+    one = np.ones(1)
+    return ObstacleTracks(
+        stamp_ns=stamp_ns, id=np.zeros(1, np.int64), position_odom=np.array([[x, y, 0.5]]),
+        velocity_odom=np.array([[speed, 0.0, 0.0]]), position_variance=one, velocity_variance=one,
+        cross_covariance=one, radius_m=np.array([0.3]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("track", "state"), [((4.1, 0.1), 0), ((4.1, 2.0), 2), (None, 2)])
+def test_where_something_moved_no_crowd_is_needed(track, state):
+    m = Mapper().see(WALL, 12).see(FRONT[:1], 8)
+    if track:
+        m.decay.take(walks_at(*track, stamp_ns=m.now_ns))
+    m.see([[-5.0, 0.0, 0.0]], 30)
+    assert m.classes(FRONT[:1]) == [state]
+
+
+@pytest.mark.parametrize(("speed", "late_ns"), [(0.2, 0), (1.0, -4_000_000_000)])
+def test_what_hardly_moves_or_moved_long_ago_leaves_no_ghosts(speed, late_ns):
+    m = Mapper().see(WALL, 12).see(FRONT[:1], 8)
+    m.decay.take(walks_at(4.1, 0.1, speed=speed, stamp_ns=m.now_ns + late_ns))
+    m.see([[-5.0, 0.0, 0.0]], 30)
+    assert m.classes(FRONT[:1]) == [2]
+
+
+def test_a_slow_walker_hit_twice_in_a_cell_does_not_become_part_of_the_forest():
+    """Without a track it is proven, and 16 cells of it stay: with one it goes. What was proven before stays."""
+    away = [[-5.0, 0.0, 0.0]]
+    for walks, state in ((False, 2), (True, 0)):
+        m = Mapper().see(WALL, 12)
+        for seen, times in ((FRONT, 8), (away, 11), (FRONT, 8), (away, 15), (away, 15)):
+            if walks:
+                m.decay.take(walks_at(4.1, 0.1, stamp_ns=m.now_ns))
+            m.see(seen, times)
+        assert m.classes(FRONT) == [state]
+    m = Mapper().see(WALL, 12).see(FRONT, 8).see(away, 11).see(FRONT, 8)
+    for _ in range(3):
+        m.decay.take(walks_at(4.1, 0.1, stamp_ns=m.now_ns))
+        m.see(away, 10)
+    assert m.classes(FRONT) == [2]
+
+
+def test_what_was_there_from_the_beginning_stays_though_something_walks_beside_it():
+    m = Mapper().see(np.vstack([FRONT, WALL]), 30)
+    m.decay.take(walks_at(4.1, 0.1, stamp_ns=m.now_ns))
+    m.see([[-5.0, 0.0, 0.0]], 30)
+    assert m.classes(FRONT) == [2]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_cells_in_cylinders_are_those_whose_middle_is(seed):
+    rng = np.random.default_rng(seed)
+    blocks = rng.integers(-3, 3, (4, 3)).astype(np.int32)
+    middle, radius, low = rng.uniform(-20, 20, (3, 2)), rng.uniform(0.2, 9.0, 3), rng.uniform(-20, 10, 3)
+    cylinders = np.column_stack([middle, radius**2, low, low + rng.uniform(0.1, 20.0, 3)])
+    cell = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5
+    at = 8.0 * blocks[:, None] + cell
+    away2 = np.sum((at[:, :, None, :2] - middle) ** 2, axis=-1)
+    z = at[:, :, 2, None]
+    inside = np.any((away2 <= radius**2) & (z >= cylinders[:, 3]) & (z <= cylinders[:, 4]), axis=2)
+    bits = walked_cells(blocks, cylinders)
+    np.testing.assert_array_equal(np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little"), inside)
 
 
 def test_a_loaded_map_loses_newcomers_only():
