@@ -38,7 +38,8 @@ class Walked:
             self._seen.popleft()
         seen = np.concatenate([np.empty((0, 4)), *(rows for _, rows in self._seen)]) / cell_m
         reach = _HALF_HEIGHT_M / cell_m
-        return np.column_stack([seen[:, :2], seen[:, 3] ** 2, seen[:, 2] - reach, seen[:, 2] + reach])
+        parts = [seen[:, :2], seen[:, 3] ** 2, seen[:, 2] - reach, seen[:, 2] + reach]
+        return np.ascontiguousarray(np.column_stack(parts))  # one layout: a kernel is compiled for each
 
 
 def walked_cells(block_xyz: NDArray[np.int32], cylinders: Array) -> NDArray[np.uint64]:
