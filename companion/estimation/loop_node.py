@@ -13,7 +13,7 @@ from companion.core.node import Node, Outputs, on
 from companion.core.topics import CORRECTIONS, LIO_STATE, MAP_FROM_ODOM, REGISTERED, WHY
 from companion.estimation.downsample import Thinner
 from companion.estimation.places.constellation import constellation, match
-from companion.estimation.places.loops import LoopConfig, LoopFinder
+from companion.estimation.places.loops import Drift, LoopConfig, LoopFinder
 from companion.estimation.places.verify import align
 from companion.estimation.places.views import panorama, sights
 
@@ -34,12 +34,16 @@ class LoopNode(Node):
     def __init__(self, config: LoopNodeConfig) -> None:
         self.config = config
         self.finder = LoopFinder(config.loops)
+        self._drift: Drift | None = None
         if config.enabled:
             self._compile()
 
     @on(LIO_STATE)
     def begin(self, state: LioState) -> Outputs:
         """A start of odometry is a new frame: what was seen before hangs on nothing."""
+        turn = rotation_from_quaternion(state.q_odom_body)[2]
+        theta, place = state.covariance[:3, :3], state.covariance[3:6, 3:6]
+        self._drift = float(np.trace(place)), float(turn @ theta @ turn)
         if state.source == "start":
             self.finder = LoopFinder(self.config.loops)
             yield MAP_FROM_ODOM(self._map_from_odom(state.stamp_ns))
@@ -50,7 +54,11 @@ class LoopNode(Node):
         if not self.config.enabled or not _usable(scan, self.finder):
             return
         R = rotation_from_quaternion(scan.q_odom_body)
-        if not self.finder.add(scan.stamp_ns, scan.points_body, R, scan.p_odom) or not self._moves():
+        refused_before = self.finder.refused
+        found = self.finder.add(scan.stamp_ns, scan.points_body, R, scan.p_odom, self._drift)
+        if self.finder.refused > refused_before:
+            yield WHY(_why(scan.stamp_ns, "a place that looks the same is another", "odometry is surer than that"))
+        if not found or not self._moves():
             return
         if refused := self.finder.audit():
             yield WHY(

@@ -32,9 +32,7 @@ class LoopConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     compare: CompareConfig = CompareConfig()
     optimise: OptimiseConfig = OptimiseConfig(kernel="dcs")
-    audit: OptimiseConfig = OptimiseConfig(
-        kernel="gnc"
-    )  # closures that it refuses are let go of before anything is said
+    audit: OptimiseConfig = OptimiseConfig(kernel="gnc")  # what it refuses is let go of before anything is said
     keyframe_m: Positive = 2.0  # way between keyframes
     submap_m: Positive = 6.0  # way between submaps
     window_m: Positive = 16.0  # way whose scans make a submap
@@ -49,11 +47,20 @@ class LoopConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     rest_m: Annotated[float, msgspec.Meta(ge=0)] = 25.0
     """After a closure that moves nothing odometry is right: so far is flown before places are compared again."""
     settled_m: Positive = 0.1  # a closure that disagrees less with the chain moves nothing
-    odometry_sigma_m: Positive = 0.01  # per keyframe ...
+    least_sigma_m: Positive = 2e-3  # per keyframe, if odometry says how it drifts; it may say too little
+    least_sigma_rad: Positive = 2e-4
+    odometry_sigma_m: Positive = 0.01  # per keyframe, if it does not say ...
     odometry_share: Positive = 0.01  # ... plus this share of the step
     odometry_sigma_rad: Positive = 2e-3
     closure_sigma_m: Positive = 0.03
     closure_sigma_rad: Positive = 4e-3
+    doubt_sigmas: Positive = (
+        5.0  # a closure that is so far from the chain, by what odometry says of itself, is wrong ...
+    )
+    doubt_from_m: Annotated[float, msgspec.Meta(ge=0)] = 0.15  # ... and farther than this
+
+
+Drift = tuple[float, float]  # variance of position (m2) and of yaw (rad2) in odom; they grow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +95,7 @@ class LoopFinder:
         self._p: list[Array] = []
         self._poses: list[Array] = []  # (7,) as corrected last, continued by odometry
         self._way: list[float] = []
+        self._drift: list[Drift | None] = []  # of the keyframes
         self._submaps: list[Submap] = []
         self._recent: deque[tuple[float, Array32]] = deque()  # (way, points in odom)
         self._last: Array | None = None
@@ -95,8 +103,10 @@ class LoopFinder:
         self._rested_m = -math.inf  # way at which a closure moved nothing
         self._thinner = Thinner()
 
-    def add(self, stamp_ns: int, points_body: Array32, R_odom_body: Array, p_odom: Array) -> int:
-        """Take in one scan (N, 3); returns the number of new closures."""
+    def add(
+        self, stamp_ns: int, points_body: Array32, R_odom_body: Array, p_odom: Array, drift: Drift | None = None
+    ) -> int:
+        """Take in one scan (N, 3); returns the number of new closures. `drift`: what odometry says of its own."""
         config = self.config
         if self._last is not None:
             self._flown_m += float(np.linalg.norm(p_odom - self._last))
@@ -106,6 +116,7 @@ class LoopFinder:
         if self._way and self._flown_m - self._way[-1] < config.keyframe_m:
             return 0
         self._keyframe(stamp_ns, R_odom_body, p_odom)
+        self._drift.append(drift)
         since = self._flown_m - (self._way[self._submaps[-1].keyframe] if self._submaps else 0.0)
         return self._close() if since >= config.submap_m else 0
 
@@ -240,7 +251,20 @@ class LoopFinder:
             return None
         R_old, R_new = self._R[old.keyframe], self._R[new.keyframe]
         R, p = R_old.T @ met.R @ R_new, R_old.T @ met.p
-        return Closure(old.keyframe, new.keyframe, R, p, met.trunks, met.near)
+        closure = Closure(old.keyframe, new.keyframe, R, p, met.trunks, met.near)
+        if self._apart_m(closure) <= self._possible_m(closure):
+            return closure
+        self.refused += 1
+        return None
+
+    def _possible_m(self, closure: Closure) -> float:
+        """How far a true closure may be from what the chain says, m; inf: odometry says nothing of itself."""
+        first, last, c = self._drift[closure.earlier], self._drift[closure.later], self.config
+        if first is None or last is None:
+            return math.inf
+        place, yaw = (max(b - a, 0.0) for a, b in zip(first, last, strict=True))
+        variance = place + yaw * float(closure.p @ closure.p) + c.closure_sigma_m**2
+        return max(c.doubt_sigmas * math.sqrt(variance), c.doubt_from_m)
 
     def _graph(self) -> PoseGraph:
         """The chain of odometry, and the closures."""
@@ -248,15 +272,19 @@ class LoopFinder:
         steps = [_relative(self._R[k], self._p[k], self._R[k + 1], self._p[k + 1]) for k in range(count - 1)]
         ends = [(k, k + 1) for k in range(count - 1)] + [(c.earlier, c.later) for c in self.closures]
         measured = np.array(steps + [_pose(c.R, c.p) for c in self.closures])
-        sigma_m = np.full(len(ends), config.closure_sigma_m)
-        sigma_m[: count - 1] = config.odometry_sigma_m + config.odometry_share * np.linalg.norm(
-            measured[: count - 1, :3], axis=1
-        )
-        sigma_rad = np.full(len(ends), config.closure_sigma_rad)
-        sigma_rad[: count - 1] = config.odometry_sigma_rad
-        weight = np.repeat(np.stack([sigma_m, sigma_rad], axis=1) ** -2.0, 3, axis=1)
+        sigmas = [self._step_sigmas(k, float(np.linalg.norm(measured[k, :3]))) for k in range(count - 1)]
+        sigmas += [(config.closure_sigma_m, config.closure_sigma_rad)] * len(self.closures)
+        weight = np.repeat(np.array(sigmas).reshape(-1, 2) ** -2.0, 3, axis=1)
         information = weight[:, :, None] * np.eye(6)
         return PoseGraph(np.arange(count), np.array(self._poses), np.array(ends), measured, information)
+
+    def _step_sigmas(self, k: int, way_m: float) -> tuple[float, float]:
+        """Of the step from keyframe k to the next, m per axis and rad: how much surer odometry was before it."""
+        first, last, c = self._drift[k], self._drift[k + 1], self.config
+        if first is None or last is None:
+            return c.odometry_sigma_m + c.odometry_share * way_m, c.odometry_sigma_rad
+        place, yaw = (max(b - a, 0.0) for a, b in zip(first, last, strict=True))
+        return math.sqrt(place / 3.0 + c.least_sigma_m**2), math.sqrt(yaw + c.least_sigma_rad**2)
 
 
 def _square(points: Array32) -> Array32:

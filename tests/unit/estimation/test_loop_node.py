@@ -1,5 +1,7 @@
 """The loop node on scans of a synthetic loop: corrections move the past towards truth, never the present."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,7 +39,7 @@ def started(stamp_ns):
 
 def _rest_of(kind):
     known = {"stamp_ns", "source", "p_odom", "v_odom", "gyro_bias_body", "accel_bias_body", "gravity_odom"}
-    values = {"q_odom_body": np.array([1.0, 0, 0, 0])}
+    values = {"q_odom_body": np.array([1.0, 0, 0, 0]), "covariance": np.full((18, 18), 1e-8)}
     return {name: values.get(name, 0) for name in kind.__dataclass_fields__ if name not in known}
 
 
@@ -94,6 +96,15 @@ def test_rotations_of_corrections_are_unit_quaternions(lap):
     for q in last.q_odom_body:
         R = rotation_from_quaternion(q)
         assert pytest.approx(np.eye(3), abs=1e-9) == R @ R.T
+
+
+def test_odometry_that_is_sure_of_itself_is_believed_and_that_is_said(lap):
+    node, said = LoopNode(LoopNodeConfig()), []
+    for message in lap[0]:
+        list(node.handle(LIO_STATE, replace(started(message.stamp_ns), source="lidar")))
+        said += [out.message for out in node.handle(REGISTERED, message)]
+    assert not [m for m in said if isinstance(m, PoseCorrections)]
+    assert "odometry is surer than that" in {m.because for m in said if isinstance(m, Why)}
 
 
 def test_without_drift_nothing_is_said():

@@ -58,13 +58,14 @@ def scans(R_true, p_true, world, rng):
         yield (spun[seen] * (reach[seen] + rng.normal(0, 0.02, seen.sum()))[:, None]).astype(np.float32)
 
 
-def flown(R_true, p_true, seed, config=None):
-    """(finder, odometry, per keyframe the number of its scan)."""
+def flown(R_true, p_true, seed, config=None, share=None):
+    """(finder, odometry); `share`: odometry says that position and yaw drift by so much per metre, in m and 0.1 rad."""
     rng = np.random.default_rng(seed)
     R, p = drifting(R_true, p_true, rng)
     finder = LoopFinder(config or LoopConfig())
     for k, points in enumerate(scans(R_true, p_true, forest(seed, p_true), rng)):
-        finder.add(k, points, R[k], p[k])
+        said = None if share is None else ((share * SPACING_M * k) ** 2, (0.1 * share * SPACING_M * k) ** 2)
+        finder.add(k, points, R[k], p[k], said)
     return finder, p
 
 
@@ -100,6 +101,29 @@ def test_corrected_way_is_the_true_one_and_the_newest_pose_stays(lapped):
     assert np.sqrt(np.mean(before**2)) > 0.5
     assert np.sqrt(np.mean(error**2)) < 0.12
     assert np.sqrt(np.mean(error**2)) < 0.2 * np.sqrt(np.mean(before**2))
+
+
+def test_odometry_that_knows_its_drift_is_corrected_as_well():
+    R_true, p_true = circle(1.6)
+    finder, _ = flown(R_true, p_true, seed=3, share=6e-3)
+    poses, scan = finder.corrected(), np.array(finder.stamps_ns)
+    assert len(finder.closures) >= 6 and finder.refused == 0
+    R_last = rotation_from_quaternion(poses[-1, 3:])
+    seen = (poses[:, :3] - poses[-1, :3]) @ R_last
+    truth = (p_true[scan] - p_true[scan[-1]]) @ R_true[scan[-1]]
+    assert np.sqrt(np.mean(np.linalg.norm(seen - truth, axis=1) ** 2)) < 0.12
+
+
+def test_a_closure_that_odometry_knows_to_be_wrong_moves_nothing():
+    """It drifts by far more than it says here, so that true closures look like wrong ones."""
+    R_true, p_true = circle(1.3)
+    finder, p = flown(R_true, p_true, seed=3, share=1e-5)
+    assert finder.refused >= 2
+    for closure in finder.closures:
+        a, b = (finder.keyframe_p_odom[k] for k in (closure.earlier, closure.later))
+        chain = finder.keyframe_R_odom(closure.earlier).T @ (b - a)
+        assert np.linalg.norm(closure.p - chain) < 0.4
+    assert finder.corrected()[:, :3] == pytest.approx(p[finder.stamps_ns], abs=0.15)
 
 
 def test_where_there_is_no_loop_none_is_found():
