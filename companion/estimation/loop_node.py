@@ -57,7 +57,9 @@ class LoopNode(Node):
         refused_before = self.finder.refused
         found = self.finder.add(scan.stamp_ns, scan.points_body, R, scan.p_odom, self._drift)
         if self.finder.refused > refused_before:
-            yield WHY(_why(scan.stamp_ns, "a place that looks the same is another", "odometry is surer than that"))
+            yield WHY(
+                _why(scan.stamp_ns, "a place seen again does not count", "it would be farther off than odometry can be")
+            )
         if not found or not self._moves():
             return
         if refused := self.finder.audit():
