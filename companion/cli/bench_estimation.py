@@ -30,7 +30,7 @@ WORLDS = {
     "clearing": "poisson,size_m=150,stems_per_ha=300,branches=4,roughness_m=0.05,clearing_m=45,start_m=75/75,"
     "margin_m=30",
     "poles": "poisson,size_m=150,stems_per_ha=300,min_spacing_m=2.5,dbh_mean_m=0.05,dbh_sd_m=0.01,crown=false,"
-    "roughness_m=0.15,margin_m=30",
+    "branches=0,roughness_m=0.15,margin_m=30",
 }
 COLUMNS = (
     "flight", "fault", "estimator", "ATE m", "drift %", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",

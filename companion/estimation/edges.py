@@ -29,9 +29,9 @@ class EdgeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     line_deg: Annotated[float, msgspec.Meta(ge=0.2, le=10)] = 1.0  # height of the band that is a scan line
     neighbours: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3  # on each side, that smoothness is taken over
-    gap_deg: Annotated[float, msgspec.Meta(gt=0, le=20)] = 2.5  # points of a line farther apart are no neighbours
+    gap_deg: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # points of a line farther apart are no neighbours
     jump_m: Positive = 0.3  # in range, from a point to the next: another thing
-    smoothness: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.05  # c of an edge, at least
+    smoothness: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.1  # c of an edge, at least
     sectors: Annotated[int, msgspec.Meta(ge=1, le=64)] = 8  # of a line
     per_sector: Count = 6  # edges, at most
 
@@ -39,7 +39,7 @@ class EdgeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 def find_edges(points_body: Array32, mount: Mount, config: EdgeConfig) -> Array:
     """Edge points (M, 3), m, body frame, of a deskewed sweep (N, 3) in the body frame, seen from the sensor.
 
-    Of a thing that is narrower than its `neighbours` the middle is taken, else the point itself.
+    Of a thing that ends within `neighbours` on both sides the middle is taken, else the point itself.
     """
     line_rad = math.radians(config.line_deg)
     rows = math.ceil(math.pi / line_rad) + 1
@@ -125,15 +125,16 @@ def _next(seen, order, begin, end, k, step, gap):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True)
 def _smoothness(points, seen, order, begin, end, k, limits, neighbours):  # type: ignore[no-untyped-def]
-    """LOAM's c; 1 where nothing is near by, 0 where something nearer hides what is beside, or the beam grazes."""
+    """LOAM's c; 1 where gaps are on both sides, 0 behind something nearer, or where the surface lies along the beam."""
     gap, jump = limits[0], limits[1]
     q = order[k]
-    sx, sy, sz, used = 0.0, 0.0, 0.0, 0
+    sx, sy, sz, used, gaps = 0.0, 0.0, 0.0, 0, 0
     for step in (-1, 1):
         at = k
         for _ in range(neighbours):
             j = _next(seen, order, begin, end, at, step, gap)
             if j < 0 or j == k:
+                gaps += 1
                 break
             other = order[j]
             fall = seen[order[at], 2] - seen[other, 2]
@@ -144,7 +145,7 @@ def _smoothness(points, seen, order, begin, end, k, limits, neighbours):  # type
             sz += points[other, 2] - points[q, 2]
             used += 1
             at = j
-    if used == 0:
+    if gaps == 2:
         return 1.0
     return np.sqrt(sx * sx + sy * sy + sz * sz) / (used * seen[q, 2])
 
@@ -182,21 +183,22 @@ def _first_after(seen, order, begin, end, azimuth):  # type: ignore[no-untyped-d
 
 @njit(cache=True, nogil=True)
 def _take(points, seen, order, begin, end, k, limits, neighbours, taken, edge):  # type: ignore[no-untyped-def]
-    """The mean of the thing that k belongs to if it is narrow, else k; what is beside k is taken with it."""
+    """The mean of the thing that k belongs to if it ends within the neighbours, else k; they are taken with it."""
     m0, m1, m2 = np.float64(points[order[k], 0]), np.float64(points[order[k], 1]), np.float64(points[order[k], 2])
     edge[0], edge[1], edge[2] = m0, m1, m2
     taken[k] = True
-    used = 1
+    used, ends = 1, 0
     for step in (-1, 1):
         at = k
         for _ in range(neighbours):
             j = _next(seen, order, begin, end, at, step, limits[0])
             if j < 0 or abs(seen[order[j], 2] - seen[order[at], 2]) > limits[1]:
+                ends += 1
                 break
             q = order[j]
             m0, m1, m2 = m0 + points[q, 0], m1 + points[q, 1], m2 + points[q, 2]
             taken[j] = True
             used += 1
             at = j
-    if used <= neighbours:
+    if ends == 2:
         edge[0], edge[1], edge[2] = m0 / used, m1 / used, m2 / used

@@ -26,7 +26,7 @@ class EdgesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Of `edges_and_planes` only: which edges there are, and how they are registered."""
 
     find: EdgeConfig = EdgeConfig()
-    map: PointMapConfig = PointMapConfig(averaged=20, max_voxels=200_000)
+    map: PointMapConfig = PointMapConfig(voxel_m=1.0, points_per_voxel=24, averaged=20, max_voxels=100_000)
     line: LineConfig = LineConfig()
     thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.15  # one edge point per voxel of this edge
     points: Annotated[int, msgspec.Meta(ge=1)] = 600  # and at most so many

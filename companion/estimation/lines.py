@@ -23,10 +23,10 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 class LineConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How lines are found and how far they are trusted."""
 
-    neighbour_m: Positive = 1.0  # the five neighbours lie within
-    straightness_m: Positive = 0.06  # and this close to their line
+    neighbour_m: Positive = 1.5  # the five neighbours lie within
+    straightness_m: Positive = 0.08  # and this close to their line
     elongation: Annotated[float, msgspec.Meta(ge=1)] = 9.0  # largest over second eigenvalue of their scatter, at least
-    sigma_m: Positive = 0.05  # of a point across its line
+    sigma_m: Positive = 0.04  # of a point across its line
     cauchy: Positive = 4.0  # squared normalised residual that halves the square root of the weight
     inflation: Positive = 3.0  # neighbouring points are not independent: information is divided by it
     gate_m: Positive = 0.5  # residual, at most

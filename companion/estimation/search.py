@@ -53,7 +53,8 @@ def search(
 
 def few_of(points_body: Array, config: SearchConfig) -> Array:
     """`config.points` of the points (N, 3), evenly."""
-    return points_body[np.linspace(0, len(points_body) - 1, min(config.points, len(points_body))).astype(int)]
+    few: Array = points_body[np.linspace(0, len(points_body) - 1, min(config.points, len(points_body))).astype(int)]
+    return few
 
 
 def _starts(radius_m: float, step_m: float) -> Array:
