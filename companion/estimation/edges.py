@@ -21,7 +21,7 @@ from companion.core.rig import Mount
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 _AZIMUTHS = 8192  # steps of a turn in which points are ordered: 0.04 degrees
-_ROWS_APART = 2  # an edge goes on within so many lines: thin poles are not hit in each
+_LINES_APART = 2  # an edge goes on within so many lines: thin poles are not hit in each
 
 
 class EdgeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -42,29 +42,28 @@ def find_edges(points_body: Array32, mount: Mount, config: EdgeConfig) -> Array:
     Of a thing that ends within `neighbours` on both sides the middle is taken, else the point itself.
     """
     line_rad = math.radians(config.line_deg)
-    rows = math.ceil(math.pi / line_rad) + 1
-    seen = np.empty((len(points_body), 3))  # azimuth, elevation, range
-    order, starts = np.empty(len(points_body), np.int64), np.zeros(rows + 1, np.int64)
-    _lines(points_body, mount.R_body_sensor, mount.p_body, line_rad, seen, order, starts)
+    starts = np.zeros(math.ceil(math.pi / line_rad) + 2, np.int64)  # of each line
+    lined = np.empty((len(points_body), 6))  # x, y, z in the body; azimuth, elevation and range from the sensor
+    _lines(points_body, mount.R_body_sensor, mount.p_body, line_rad, lined, starts)
     out = np.empty((len(points_body), 3))
     limits = (math.radians(config.gap_deg), config.jump_m, config.smoothness, line_rad)
     counts = (config.neighbours, config.sectors, config.per_sector)
-    found = _edges(points_body, seen, order, starts, limits, counts, out)
-    return out[:found]
+    return out[: _edges(lined, starts, limits, counts, out)]
 
 
 @njit(cache=True, nogil=True)
-def _lines(points, R, p, line_rad, seen, order, starts):  # type: ignore[no-untyped-def]
-    """Azimuth, elevation and range from the sensor; the order by line, then azimuth, by two counting sorts."""
+def _lines(points, R, p, line_rad, lined, starts):  # type: ignore[no-untyped-def]
+    """The points by line, then azimuth, by two counting sorts."""
     n = points.shape[0]
-    turn, row, first = np.empty(n, np.int64), np.empty(n, np.int64), np.zeros(_AZIMUTHS + 1, np.int64)
+    seen, turn, row = np.empty((n, 3)), np.empty(n, np.int64), np.empty(n, np.int64)
+    first = np.zeros(_AZIMUTHS + 1, np.int64)
     for q in range(n):
         a, b, c = points[q, 0] - p[0], points[q, 1] - p[1], points[q, 2] - p[2]
         x = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
         y = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
         z = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
-        seen[q, 0], seen[q, 1] = np.arctan2(y, x), np.arctan2(z, np.sqrt(x * x + y * y))
-        seen[q, 2] = np.sqrt(x * x + y * y + z * z)
+        level = np.sqrt(x * x + y * y)
+        seen[q, 0], seen[q, 1], seen[q, 2] = np.arctan2(y, x), np.arctan2(z, level), np.sqrt(x * x + y * y + z * z)
         turn[q] = min(int((seen[q, 0] + np.pi) / (2.0 * np.pi) * _AZIMUTHS), _AZIMUTHS - 1)
         row[q] = int((seen[q, 1] + 0.5 * np.pi) / line_rad)
         first[turn[q] + 1] += 1
@@ -74,107 +73,98 @@ def _lines(points, R, p, line_rad, seen, order, starts):  # type: ignore[no-unty
     for q in range(n):
         around[first[turn[q]]] = q
         first[turn[q]] += 1
-    for k in range(n):
-        q = around[k]
-        order[at[row[q]]] = q
+    for u in range(n):
+        q = around[u]
+        k = at[row[q]]
         at[row[q]] += 1
+        for i in range(3):
+            lined[k, i], lined[k, 3 + i] = points[q, i], seen[q, i]
 
 
 @njit(cache=True, nogil=True)
-def _edges(points, seen, order, starts, limits, counts, out):  # type: ignore[no-untyped-def]
+def _edges(lined, starts, limits, counts, out):  # type: ignore[no-untyped-def]
     """Line by line and sector by sector, the largest c first; returns how many."""
-    n = order.shape[0]
-    c, taken = np.zeros(n), np.zeros(n, np.bool_)
+    c = np.zeros(lined.shape[0])
     found = 0
     for row in range(starts.shape[0] - 1):
         begin, end = starts[row], starts[row + 1]
         for k in range(begin, end):
-            c[k] = _smoothness(points, seen, order, begin, end, k, limits, counts[0])
-            if c[k] < limits[2] or not _goes_on(points, seen, order, starts, row, order[k], limits):
+            c[k] = _smoothness(lined, begin, end, k, limits, counts[0])
+            if c[k] < limits[2] or not _goes_on(lined, starts, row, k, limits):
                 c[k] = 0.0
         for sector in range(counts[1]):
             low = begin + (end - begin) * sector // counts[1]
             high = begin + (end - begin) * (sector + 1) // counts[1]
             for _ in range(counts[2]):
-                best = -1
+                best = low
                 for k in range(low, high):
-                    if c[k] > 0.0 and not taken[k] and (best < 0 or c[k] > c[best]):
+                    if c[k] > c[best]:
                         best = k
-                if best < 0:
+                if low == high or c[best] == 0.0:
                     break
-                _take(points, seen, order, begin, end, best, limits, counts[0], taken, out[found])
+                _take(lined, begin, end, best, limits, counts[0], c, out[found])
                 found += 1
     return found
 
 
 @njit(cache=True, nogil=True)
-def _next(seen, order, begin, end, k, step, gap):  # type: ignore[no-untyped-def]
+def _next(lined, begin, end, k, step, gap):  # type: ignore[no-untyped-def]
     """The neighbour of k in its line, around the circle; -1: a gap."""
-    if end - begin < 2:
-        return -1
     j = k + step
     if j >= end:
         j = begin
     elif j < begin:
         j = end - 1
-    away = (seen[order[j], 0] - seen[order[k], 0]) * step
-    if away < -1e-3:  # past the seam; azimuth steps may stand in any order
+    away = (lined[j, 3] - lined[k, 3]) * step
+    if away < -1e-3:  # past the seam; azimuths within a step of the sort stand in any order
         away += 2.0 * np.pi
-    return j if away <= gap else -1
+    return j if away <= gap and j != k else -1
 
 
 @njit(cache=True, nogil=True)
-def _smoothness(points, seen, order, begin, end, k, limits, neighbours):  # type: ignore[no-untyped-def]
+def _smoothness(lined, begin, end, k, limits, neighbours):  # type: ignore[no-untyped-def]
     """LOAM's c; 1 where gaps are on both sides, 0 behind something nearer, or where the surface lies along the beam."""
-    gap, jump = limits[0], limits[1]
-    q = order[k]
+    gap, jump, range_m = limits[0], limits[1], lined[k, 5]
     sx, sy, sz, used, gaps = 0.0, 0.0, 0.0, 0, 0
     for step in (-1, 1):
         at = k
         for _ in range(neighbours):
-            j = _next(seen, order, begin, end, at, step, gap)
-            if j < 0 or j == k:
+            j = _next(lined, begin, end, at, step, gap)
+            if j < 0:
                 gaps += 1
                 break
-            other = order[j]
-            fall = seen[order[at], 2] - seen[other, 2]
-            if fall > jump and seen[other, 2] < seen[q, 2] - jump:
+            if lined[at, 5] - lined[j, 5] > jump and lined[j, 5] < range_m - jump:
                 return 0.0
-            sx += points[other, 0] - points[q, 0]
-            sy += points[other, 1] - points[q, 1]
-            sz += points[other, 2] - points[q, 2]
+            sx, sy, sz = sx + lined[j, 0] - lined[k, 0], sy + lined[j, 1] - lined[k, 1], sz + lined[j, 2] - lined[k, 2]
             used += 1
             at = j
     if gaps == 2:
         return 1.0
-    return np.sqrt(sx * sx + sy * sy + sz * sz) / (used * seen[q, 2])
+    return np.sqrt(sx * sx + sy * sy + sz * sz) / (used * range_m)
 
 
 @njit(cache=True, nogil=True)
-def _goes_on(points, seen, order, starts, row, q, limits):  # type: ignore[no-untyped-def]
-    """Whether a line above or below has a point from which q is no farther than 30 degrees to the beam allow."""
-    gap, line_rad = limits[0], limits[3]
-    for other in range(max(row - _ROWS_APART, 0), min(row + _ROWS_APART + 1, starts.shape[0] - 1)):
+def _goes_on(lined, starts, row, k, limits):  # type: ignore[no-untyped-def]
+    """Whether a line above or below has a point to which the way from k leaves the beam by 30 degrees or more."""
+    gap, line_rad, azimuth = limits[0], limits[3], lined[k, 3]
+    for other in range(max(row - _LINES_APART, 0), min(row + _LINES_APART + 1, starts.shape[0] - 1)):
         if other == row:
             continue
-        k = _first_after(seen, order, starts[other], starts[other + 1], seen[q, 0] - 0.5 * gap)
-        while k < starts[other + 1] and seen[order[k], 0] <= seen[q, 0] + 0.5 * gap:
-            j = order[k]
-            k += 1
-            apart = abs(seen[j, 1] - seen[q, 1])
-            if apart < 0.5 * line_rad:
-                continue
-            x, y, z = points[j, 0] - points[q, 0], points[j, 1] - points[q, 1], points[j, 2] - points[q, 2]
-            if x * x + y * y + z * z < (2.0 * apart * seen[q, 2]) ** 2:
+        j = _first_after(lined, starts[other], starts[other + 1], azimuth - 0.5 * gap)
+        while j < starts[other + 1] and lined[j, 3] <= azimuth + 0.5 * gap:
+            apart = abs(lined[j, 4] - lined[k, 4])
+            x, y, z = lined[j, 0] - lined[k, 0], lined[j, 1] - lined[k, 1], lined[j, 2] - lined[k, 2]
+            if apart > 0.5 * line_rad and x * x + y * y + z * z < (2.0 * apart * lined[k, 5]) ** 2:
                 return True
+            j += 1
     return False
 
 
 @njit(cache=True, nogil=True)
-def _first_after(seen, order, begin, end, azimuth):  # type: ignore[no-untyped-def]
+def _first_after(lined, begin, end, azimuth):  # type: ignore[no-untyped-def]
     while begin < end:
         middle = (begin + end) // 2
-        if seen[order[middle], 0] < azimuth:
+        if lined[middle, 3] < azimuth:
             begin = middle + 1
         else:
             end = middle
@@ -182,22 +172,21 @@ def _first_after(seen, order, begin, end, azimuth):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def _take(points, seen, order, begin, end, k, limits, neighbours, taken, edge):  # type: ignore[no-untyped-def]
-    """The mean of the thing that k belongs to if it ends within the neighbours, else k; they are taken with it."""
-    m0, m1, m2 = np.float64(points[order[k], 0]), np.float64(points[order[k], 1]), np.float64(points[order[k], 2])
+def _take(lined, begin, end, k, limits, neighbours, c, edge):  # type: ignore[no-untyped-def]
+    """The mean of the thing that k belongs to if it ends within the neighbours, else k; none of them is taken again."""
+    m0, m1, m2 = lined[k, 0], lined[k, 1], lined[k, 2]
     edge[0], edge[1], edge[2] = m0, m1, m2
-    taken[k] = True
+    c[k] = 0.0
     used, ends = 1, 0
     for step in (-1, 1):
         at = k
         for _ in range(neighbours):
-            j = _next(seen, order, begin, end, at, step, limits[0])
-            if j < 0 or abs(seen[order[j], 2] - seen[order[at], 2]) > limits[1]:
+            j = _next(lined, begin, end, at, step, limits[0])
+            if j < 0 or abs(lined[j, 5] - lined[at, 5]) > limits[1]:
                 ends += 1
                 break
-            q = order[j]
-            m0, m1, m2 = m0 + points[q, 0], m1 + points[q, 1], m2 + points[q, 2]
-            taken[j] = True
+            m0, m1, m2 = m0 + lined[j, 0], m1 + lined[j, 1], m2 + lined[j, 2]
+            c[j] = 0.0
             used += 1
             at = j
     if ends == 2:

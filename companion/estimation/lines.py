@@ -16,6 +16,7 @@ from numba import njit
 from companion.core.messages import Array
 from companion.estimation.point_map import PointMap
 from companion.estimation.registration import Flags, Normal, nearest_five
+from companion.estimation.so3 import multiply_into
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -117,22 +118,21 @@ def _fit_line(near, straight2, elongation, line):  # type: ignore[no-untyped-def
     trace = S[0, 0] + S[1, 1] + S[2, 2]
     if trace < 1e-9:
         return False
-    M = S / trace
+    M, square = S / trace, np.empty((3, 3))
     for _ in range(4):
-        M = M @ M
-        M /= M[0, 0] + M[1, 1] + M[2, 2]
-    k = 0
-    for i in range(1, 3):
-        if M[i, i] > M[k, k]:
-            k = i
-    d = M[:, k] / np.sqrt(M[0, k] ** 2 + M[1, k] ** 2 + M[2, k] ** 2)
-    largest = d @ (S @ d)
+        multiply_into(M, M, square)
+        M[:] = square / (square[0, 0] + square[1, 1] + square[2, 2])
+    k = 0 if M[0, 0] >= M[1, 1] and M[0, 0] >= M[2, 2] else (1 if M[1, 1] >= M[2, 2] else 2)
+    d = M[k] / np.sqrt(M[k, 0] ** 2 + M[k, 1] ** 2 + M[k, 2] ** 2)  # a row is a column, too
+    largest = 0.0
+    for i in range(3):
+        largest += d[i] * (S[i, 0] * d[0] + S[i, 1] * d[1] + S[i, 2] * d[2])
     if largest < elongation * _second(S, trace, largest):
         return False
     line[:3], line[3:] = mean, d
     for u in range(5):
-        off = near[u] - mean
-        if off @ off - (off @ d) ** 2 > straight2:
+        x, y, z = near[u, 0] - mean[0], near[u, 1] - mean[1], near[u, 2] - mean[2]
+        if x * x + y * y + z * z - (x * d[0] + y * d[1] + z * d[2]) ** 2 > straight2:
             return False
     return True
 

@@ -6,6 +6,7 @@ import pytest
 
 from companion.core.geometry import exp_so3, log_so3
 from companion.core.rig import Mount, Rig
+from companion.estimation import edges as edges_module
 from companion.estimation import lines
 from companion.estimation.config import EstimationConfig
 from companion.estimation.edges import EdgeConfig, find_edges
@@ -14,7 +15,9 @@ from companion.estimation.lines import LineConfig, LineRegistration, find_lines
 from companion.estimation.lio import Lio, LioConfig
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.registration import PlaneConfig, PlaneRegistration
+from companion.estimation.search import SearchConfig, search
 from companion.estimation.so3 import orthonormal
+from companion.estimation.warm_up import warm_up
 from sim.sensors.patterns import rosette_pattern, spin_pattern
 from tests.unit.estimation.synthetic import cast
 from tests.unit.estimation.test_kernels import check_normal_equations
@@ -258,3 +261,23 @@ def test_a_wrong_choice_is_told():
         msgspec.convert({"lio": {"features": "corners"}}, EstimationConfig)
     with pytest.raises(msgspec.ValidationError, match=r"Expected `float` >= 0.2 - at `\$.lio.edges.find.line_deg`"):
         msgspec.convert({"lio": {"edges": {"find": {"line_deg": 0.0}}}}, EstimationConfig)
+
+
+def test_the_search_after_a_gap_finds_its_way_among_poles():
+    edges, _, seen, (R_true, p_true) = known_motion()
+    found, config = edges.find(seen), SearchConfig()
+    guess = np.eye(3), p_true + np.array([0.9, -0.7, 0.0])
+    R, p, share = search(lambda: LineRegistration(edges.map, found, config.line), guess, sigma_m=0.5, config=config)
+    assert np.linalg.norm((p - p_true)[:2]) < 0.03
+    assert np.linalg.norm(log_so3(R.T @ R_true)) < 0.01
+    assert share > 0.8
+
+
+def test_no_kernel_is_left_to_compile_after_the_warm_up():
+    config = msgspec.structs.replace(LioConfig(), features="edges_and_planes")
+    warm_up(msgspec.structs.replace(EstimationConfig(), lio=config), Rig())
+    kernels = (edges_module._lines, edges_module._edges, lines._find_lines, lines._linearise)
+    before = [len(k.signatures) for k in kernels]
+    fly(config)
+    assert [len(k.signatures) for k in kernels] == before
+    assert min(before) > 0
