@@ -29,6 +29,8 @@ WORLDS = {
     "forest": "poisson,size_m=150,stems_per_ha=300,branches=4,roughness_m=0.15,margin_m=30",
     "clearing": "poisson,size_m=150,stems_per_ha=300,branches=4,roughness_m=0.05,clearing_m=45,start_m=75/75,"
     "margin_m=30",
+    "poles": "poisson,size_m=150,stems_per_ha=300,min_spacing_m=2.5,dbh_mean_m=0.05,dbh_sd_m=0.01,crown=false,"
+    "branches=0,roughness_m=0.15,margin_m=30",
 }
 COLUMNS = (
     "flight", "fault", "estimator", "ATE m", "drift %", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",
@@ -37,8 +39,8 @@ COLUMNS = (
 
 
 def estimation(
-    courses: Annotated[str, typer.Option(help="Of forest, clearing; with commas.")] = "forest,clearing",
-    speeds: Annotated[str, typer.Option(help="Speed limits in the forest, m/s; 4 in the clearing.")] = "4,8",
+    courses: Annotated[str, typer.Option(help="Of forest, clearing, poles; with commas.")] = "forest,clearing",
+    speeds: Annotated[str, typer.Option(help="Speed limits, m/s; always 4 in the clearing.")] = "4,8",
     seeds: Annotated[str, typer.Option(help="Seeds of world, gusts and sensors.")] = "1",
     faults: Annotated[
         list[str] | None, typer.Option("--fault", help="none, range_12,no_camera, lidar_gap_3@40, ...; repeatable.")
@@ -89,8 +91,8 @@ def _rows(
 def _folders(courses: str, speeds: str, seeds: str, parent: Path, own: list[str]) -> Iterator[tuple[Path, str]]:
     """Folder and name of each flight; one that is not there is recorded now."""
     for course in courses.split(","):
-        kind = one_of(course, ("forest", "clearing"), "--courses")
-        for speed in speed_limits(speeds) if kind == "forest" else [4.0]:
+        kind = one_of(course, tuple(WORLDS), "--courses")
+        for speed in [4.0] if kind == "clearing" else speed_limits(speeds):
             for seed in _seeds(seeds):
                 folder = parent / f"{kind}_{speed:g}_{seed}"
                 if not (folder / LOG).is_file():
@@ -102,7 +104,7 @@ def _record(kind: str, speed: float, seed: int, folder: Path, own: list[str]) ->
     console = Console(stderr=True)
     console.print(f"recording {folder.name}", style="dim", highlight=False)
     with open_simulator(WORLDS[kind], seed, [*GUSTS, *own], 0, console) as sim:
-        course = tour(sim.world.cones, top_m_s=speed, seed=seed) if kind == "forest" else ring(top_m_s=speed)
+        course = ring(top_m_s=speed) if kind == "clearing" else tour(sim.world.cones, top_m_s=speed, seed=seed)
         record_course(course, folder, stack_config(None, ()), sim=sim.new_node(), mission=course_mission())
 
 

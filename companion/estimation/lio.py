@@ -9,7 +9,7 @@ lio.filter.state.p                        # where we are, in odom
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -20,13 +20,15 @@ from companion.estimation.blind_axes import BlindAxes, BlindAxesConfig, BlindDri
 from companion.estimation.camera import CameraConfig, CameraTracker
 from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
 from companion.estimation.downsample import Thinner
+from companion.estimation.features import EdgeMap, EdgesAndPlanes, EdgesConfig, Registration
 from companion.estimation.filter import Filter, Linearise
 from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
+from companion.estimation.lines import LineConfig, LineRegistration
 from companion.estimation.map_error import MapError, MapErrorConfig
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagation import NODE, ImuNoise
 from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
-from companion.estimation.search import SearchConfig, search
+from companion.estimation.search import SearchConfig, few_of, search
 from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
 
@@ -43,6 +45,8 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     gate: ScanGate = ScanGate()
     map: PointMapConfig = PointMapConfig(averaged=20)
     plane: PlaneConfig = PlaneConfig(flatness_m=0.03, sigma_m=0.03)
+    features: Literal["planes", "edges_and_planes"] = "planes"  # the second for thin poles, which have no planes
+    edges: EdgesConfig = EdgesConfig()
     map_error: MapErrorConfig = MapErrorConfig()
     search: SearchConfig = SearchConfig()
     imu_doubt: ImuDoubtConfig = ImuDoubtConfig()
@@ -53,7 +57,7 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # one point per voxel of this edge is registered
     points: Count = 1500  # and at most so many
     iterations: Count = 5
-    min_planes: Annotated[int, msgspec.Meta(ge=6)] = 20  # fewer: the scan is not used
+    min_planes: Annotated[int, msgspec.Meta(ge=6)] = 20  # or edges on lines; fewer: the scan is not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +84,7 @@ class Lio:
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
         self._nodes = np.empty((0, NODE))
         self._thinner = Thinner()
+        self._edges = EdgeMap(config.edges, rig.lidar) if config.features == "edges_and_planes" else None
         self._densities = config.noise.densities
         self._standing = Standing(start, config.standing)
         self._tracker = CameraTracker(camera or CameraConfig(), rig)
@@ -109,12 +114,13 @@ class Lio:
             mount=self._mount,
             gate=self.config.gate,
         )
-        normal = self._register(points_body) if self.map.voxels else None
+        edges_body = self._edges.find(points_body) if self._edges else np.empty((0, 3))
+        normal = self._register(points_body, edges_body) if self.map.voxels else None
         if normal is None and self.map.voxels:
             return ScanResult(points_body, None, agrees=False)
         spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
         if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):
-            self._extend(spaced)
+            self._extend(spaced, edges_body)
             self._scan_s, self._back_s = self.filter.t_s, None
         return ScanResult(points_body, normal)
 
@@ -153,16 +159,15 @@ class Lio:
             self._track_error.extend(self.filter.state, self.filter.P, share)
         return normal
 
-    def _register(self, points_body: Array32) -> Normal | None:
+    def _register(self, points_body: Array32, edges_body: Array) -> Normal | None:
         """What the sweep said; None: it came after a gap, does not fit the map, and corrected nothing."""
         self._take_back_drift()
         before, prior = self._pose(), (self.filter.state.copy(), self.filter.P)
         few = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
-        scan = PlaneRegistration(self.map, few, self.config.plane)
         c = self.config
-        normal = self.filter.update(
-            self._softened(scan), iterations=c.iterations, at_least=c.min_planes, begin=self._found(few)
-        )
+        scan = self._registration(few, edges_body, (c.plane, c.edges.line))
+        found = self._found(few, edges_body)
+        normal = self.filter.update(self._softened(scan), iterations=c.iterations, at_least=c.min_planes, begin=found)
         if self._is_back() and not self._agrees(scan):
             self.filter.state.x[:], self.filter.P = prior[0].x, prior[1]
             return None
@@ -172,31 +177,41 @@ class Lio:
         self._imu_doubt.corrected(self.filter)
         return normal
 
-    def _softened(self, scan: PlaneRegistration) -> Linearise:
+    def _registration(self, few: Array, edges_body: Array, how: tuple[PlaneConfig, LineConfig]) -> Registration:
+        """Of points (N, 3) and edges (M, 3), m, body frame."""
+        planes = PlaneRegistration(self.map, few, how[0])
+        if self._edges is None:
+            return planes
+        return EdgesAndPlanes(planes, LineRegistration(self._edges.map, edges_body, how[1]))
+
+    def _softened(self, scan: Registration) -> Linearise:
         """What the scan says, less of it along axes in which it is blind."""
         P = (self.filter.P + self._drift.covariance)[:6, :6]
         return lambda R, p: self._blind.soften(scan.linearise(R, p), P)
 
-    def _found(self, points_body: Array) -> tuple[Array, Array] | None:
+    def _found(self, points_body: Array, edges_body: Array) -> tuple[Array, Array] | None:
         """After a gap, where registration is to begin; None: where the filter is."""
         if not self._is_back():
             return None
-        P, state = self.filter.P, self.filter.state
+        P, state, c = self.filter.P, self.filter.state, self.config.search
         sigma_m = float(np.sqrt(max(P[3, 3], P[4, 4])))
+        few, edges = few_of(points_body, c), few_of(edges_body, c)
         pose = (state.R.copy(), state.p.copy())
-        return search(self.map, points_body, pose, sigma_m=sigma_m, config=self.config.search)[:2]
+        how = c.plane, c.line
+        return search(lambda: self._registration(few, edges, how), pose, sigma_m=sigma_m, config=c)[:2]
 
     def _is_back(self) -> bool:
         """Whether sweeps came back after a gap, and none has been used since."""
         return self.filter.t_s - self._scan_s > self.config.search.after_s
 
-    def _agrees(self, scan: PlaneRegistration) -> bool:
+    def _agrees(self, scan: Registration) -> bool:
         """Most of what meets the map must lie on it; after a while without, the map goes on from here."""
         state, c = self.filter.state, self.config.search
         self._back_s = self.filter.t_s if self._back_s is None else self._back_s
         if self.filter.t_s - self._back_s > c.hold_s:
             return True
-        return scan.fit_within(state.R, state.p, c.fits_m) > c.agree_share
+        fitting, met, offered = scan.fits(state.R, state.p, c.fits_m)
+        return met > 0.05 * offered and fitting / met > c.agree_share
 
     def _take_back_drift(self) -> None:
         """What camera or IMU alone may have drifted, a sweep that sees can mend: it is the filter's then."""
@@ -211,8 +226,10 @@ class Lio:
             self.filter.P = self.filter.P + self._drift.covariance
             self._drift.reset()
 
-    def _extend(self, spaced: Array32) -> None:
+    def _extend(self, spaced: Array32, edges_body: Array) -> None:
         state = self.filter.state
+        if self._edges is not None:
+            self._edges.insert(edges_body, state.R, state.p)
         share = self.map.insert(spaced, state.R, state.p) / max(len(spaced), 1)
         self._map_error.move(state.p)
         self._map_error.extend(state, self.filter.P, share * self.config.map_error.share)

@@ -96,21 +96,15 @@ class PlaneRegistration:
         used = _linearise(self.points, R, p, self._planes, self._valid, limits, H, g)
         return Normal(R.copy(), p.copy(), H / c.inflation, g / c.inflation, used, len(self.points))
 
-    def share_within(self, R: Array, p: Array, distance_m: float) -> float:
-        """Share of all points that lie within a distance of their plane, searched anew at the pose."""
-        return float(self._within(R, p, distance_m).mean())
+    def fits(self, R: Array, p: Array, distance_m: float) -> tuple[int, int, int]:
+        """How many points lie within a distance of their plane, how many have one, and how many there are.
 
-    def fit_within(self, R: Array, p: Array, distance_m: float) -> float:
-        """The same, of the points that have a plane; 0 if fewer than one in twenty has one."""
-        within = self._within(R, p, distance_m)
-        return float(within.sum() / self._valid.sum()) if self._valid.mean() > 0.05 else 0.0
-
-    def _within(self, R: Array, p: Array, distance_m: float) -> Flags:
+        Planes are searched anew at the pose.
+        """
         find_planes(self._map, self.points, R, p, self._config, self._planes, self._valid)
         self._searched = (R.copy(), p.copy())
         off = np.abs((self._planes[:, :3] * (self.points @ R.T + p)).sum(axis=1) + self._planes[:, 3])
-        within: Flags = self._valid & (off < distance_m)
-        return within
+        return int((self._valid & (off < distance_m)).sum()), int(self._valid.sum()), len(self.points)
 
     def _is_stale(self, R: Array, p: Array) -> bool:
         if self._searched is None:
@@ -147,7 +141,7 @@ def _find_planes(store, points, R, p, limits, planes, valid):  # type: ignore[no
             x[i] = R[i, 0] * points[q, 0] + R[i, 1] * points[q, 1] + R[i, 2] * points[q, 2] + p[i]
         for u in range(5):
             near2[u] = limits[1]
-        valid[q] = _nearest_five(store, x, limits[0], near2, near) and _fit_plane(near, limits[2], limits[3], plane)
+        valid[q] = nearest_five(store, x, limits[0], near2, near) and _fit_plane(near, limits[2], limits[3], plane)
         if valid[q]:
             for i in range(4):
                 planes[q, i] = plane[i]
@@ -168,7 +162,7 @@ _ORDER = _nearest_first()
 
 
 @njit(cache=True, nogil=True)
-def _nearest_five(store, x, voxel_m, near2, near):  # type: ignore[no-untyped-def]
+def nearest_five(store, x, voxel_m, near2, near):  # type: ignore[no-untyped-def]
     """The 27 voxels around x, nearer ones first, skipping those that cannot hold a nearer point."""
     keys, value, counts, pool = store
     i0, j0, k0 = (

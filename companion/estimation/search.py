@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import msgspec
@@ -9,8 +10,9 @@ import numpy as np
 
 from companion.core.geometry import exp_so3
 from companion.core.messages import Array
-from companion.estimation.point_map import PointMap
-from companion.estimation.registration import PlaneConfig, PlaneRegistration
+from companion.estimation.features import Registration
+from companion.estimation.lines import LineConfig
+from companion.estimation.registration import PlaneConfig
 from companion.estimation.so3 import orthonormal
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -27,26 +29,32 @@ class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     points: Count = 500
     iterations: Count = 5
     plane: PlaneConfig = PlaneConfig(sigma_m=0.15, neighbour_m=1.0)
+    line: LineConfig = LineConfig(sigma_m=0.15)  # where edges are registered, too
     fits_m: Positive = 0.06  # a point this near to its plane fits
     agree_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.55  # of the points with a plane must fit
     hold_s: Annotated[float, msgspec.Meta(ge=0)] = 2.0  # for so long sweeps that do not agree are left out
 
 
 def search(
-    target: PointMap, points_body: Array, pose: tuple[Array, Array], *, sigma_m: float, config: SearchConfig
+    begin: Callable[[], Registration], pose: tuple[Array, Array], *, sigma_m: float, config: SearchConfig
 ) -> tuple[Array, Array, float]:
     """(R, p, share of points that fit) of the best of many starts around `pose` = (R_odom_body, p_odom).
 
-    `points_body` (N, 3) is evenly thinned to `config.points`. Starts lie on a horizontal grid, the predicted
-    pose first, which also wins a draw.
+    `begin` gives a fresh registration of the scan, thinned by `few_of`. Starts lie on a horizontal grid, the
+    predicted pose first, which also wins a draw.
     """
-    few = points_body[np.linspace(0, len(points_body) - 1, min(config.points, len(points_body))).astype(int)]
     best = (*pose, -1.0)
     for offset in _starts(min(max(3.0 * sigma_m, config.step_m), config.radius_m), config.step_m):
-        found = _fit(target, few, (pose[0], pose[1] + offset), config)
+        found = _fit(begin(), (pose[0], pose[1] + offset), config)
         if found[2] > best[2] + 1e-9:
             best = found
     return best
+
+
+def few_of(points_body: Array, config: SearchConfig) -> Array:
+    """`config.points` of the points (N, 3), evenly."""
+    few: Array = points_body[np.linspace(0, len(points_body) - 1, min(config.points, len(points_body))).astype(int)]
+    return few
 
 
 def _starts(radius_m: float, step_m: float) -> Array:
@@ -59,11 +67,8 @@ def _starts(radius_m: float, step_m: float) -> Array:
     return np.column_stack([x[order], y[order], np.zeros(len(order))])
 
 
-def _fit(
-    target: PointMap, points: Array, start: tuple[Array, Array], config: SearchConfig
-) -> tuple[Array, Array, float]:
+def _fit(scan: Registration, start: tuple[Array, Array], config: SearchConfig) -> tuple[Array, Array, float]:
     R, p = start
-    scan = PlaneRegistration(target, points, config.plane)
     for _ in range(config.iterations):
         normal = scan.linearise(R, p)
         if normal.used < 6:
@@ -72,4 +77,5 @@ def _fit(
         R, p = orthonormal(R @ exp_so3(step[:3])), p + step[3:]
         if np.linalg.norm(step[:3]) < 1e-3 and np.linalg.norm(step[3:]) < 1e-2:
             break
-    return R, p, scan.share_within(R, p, config.fits_m)
+    fitting, _, offered = scan.fits(R, p, config.fits_m)
+    return R, p, fitting / max(offered, 1)

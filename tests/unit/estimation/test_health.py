@@ -11,7 +11,7 @@ from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
 from companion.estimation.map_error import MapError
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
-from companion.estimation.search import SearchConfig, search
+from companion.estimation.search import SearchConfig, few_of, search
 from companion.estimation.start import StartConfig, start_filter
 from companion.estimation.state import State
 
@@ -111,12 +111,17 @@ def test_the_search_finds_a_pose_that_is_metres_away():
     R, p = Rotation.from_euler("z", 0.05).as_matrix(), np.array([0.4, -0.3, 0.1])
     seen = (room(rng) - p) @ R
     guess = (np.eye(3), p + np.array([1.9, -1.4, 0.05]))
-    found_R, found_p, share = search(target, seen, guess, sigma_m=1.0, config=SearchConfig())
+    config = SearchConfig()
+    found_R, found_p, share = search(
+        lambda: PlaneRegistration(target, few_of(seen, config), config.plane), guess, sigma_m=1.0, config=config
+    )
     assert np.linalg.norm(found_p - p) < 0.05
     assert np.linalg.norm(Rotation.from_matrix(found_R.T @ R).as_rotvec()) < 0.01
     assert share > 0.5
     scan = PlaneRegistration(target, seen, PlaneConfig())
-    assert scan.fit_within(R, p, 0.06) > 0.9 > 0.6 > scan.fit_within(*guess, 0.06)
+    (fits, met, offered), (wrong, also_met, _) = scan.fits(R, p, 0.06), scan.fits(*guess, 0.06)
+    assert offered == len(seen)
+    assert fits / met > 0.9 > 0.6 > wrong / also_met
 
 
 def test_blind_directions_are_named_in_odom():
