@@ -18,6 +18,7 @@ from companion.core.messages import Array, Array32, Bytes2D
 from companion.core.rig import Rig
 from companion.estimation.camera import CameraConfig, CameraTracker
 from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
+from companion.estimation.direct_camera import DirectCamera
 from companion.estimation.downsample import Thinner
 from companion.estimation.filter import Filter, Linearise
 from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
@@ -80,7 +81,7 @@ class Lio:
         self._thinner = Thinner()
         self._densities = config.noise.densities
         self._standing = Standing(start, config.standing)
-        self._tracker = CameraTracker(camera or CameraConfig(), rig)
+        self._tracker = _camera_of(camera or CameraConfig(), rig)
 
     @classmethod
     def at_rest(cls, samples: Array, config: LioConfig, rig: Rig, camera: CameraConfig | None = None) -> Lio:
@@ -219,3 +220,7 @@ class Lio:
     def _pose(self) -> tuple[Array, Array, Array]:
         state = self.filter.state
         return state.R.copy(), state.p.copy(), state.v.copy()
+
+
+def _camera_of(config: CameraConfig, rig: Rig) -> CameraTracker | DirectCamera:
+    return DirectCamera(config, rig) if config.method == "direct" else CameraTracker(config, rig)
