@@ -19,7 +19,7 @@ from companion.estimation.filter import Filter
 from companion.estimation.ground_rays import GroundRays
 from companion.estimation.image_gate import ImageGate
 from companion.estimation.patches import cut, no_patches, pyramid
-from companion.estimation.photometric import FOUND, MISSED, learn_depths, linearise
+from companion.estimation.photometric import FOUND, MISSED, linearise
 from companion.estimation.point_map import PointMap
 from companion.estimation.registration import Normal, PlaneConfig
 
@@ -33,8 +33,6 @@ class DirectCamera:
         self._intrinsics = np.array([rig.pinhole.focal_px, *rig.pinhole.center_px])
         self._ground = GroundRays(rig, depth_m=(config.min_depth_m, config.max_depth_m))
         self._gate = ImageGate(config.image)
-        c = config.direct
-        self._grey = (c.sigma_grey, c.correlated_px, c.min_correlation, float((2 * c.half_px + 1) ** 2))
         self._bad_images = 0  # in a row
         self.forget()
         self.objection = ""  # to the last image
@@ -75,9 +73,6 @@ class DirectCamera:
 
         begin = self._coarse(images, filter_)
         normal = filter_.update(finest, iterations=c.iterations, at_least=c.min_patches, begin=begin)
-        if normal.used >= c.min_patches and c.learns_depth:
-            view = self._view(images[0], filter_.state.R, filter_.state.p)
-            learn_depths(self._patches.arrays, view, self._grey, c.depth_px**2, c.least_depth_m**2)
         self._patches.misses = np.where(fate == FOUND, 0.0, self._patches.misses + 1.0)
         alive = (fate == FOUND) | ((fate == MISSED) & (self._patches.misses < c.misses))
         self._patches = self._patches.only(alive)
@@ -101,13 +96,12 @@ class DirectCamera:
         self, images: list[Array32], level: int, pose: tuple[Array, Array], gate: float, fate: NDArray[np.int8]
     ) -> Normal:
         H, g = np.empty((6, 6)), np.empty(6)
-        c = self._direct
-        trust = (self._grey, c.sigma_px**2, c.cauchy, gate)
-        used = linearise(self._patches.arrays, level, self._view(images[level], *pose), trust, H, g, fate)
-        return Normal(pose[0].copy(), pose[1].copy(), H / c.inflation, g / c.inflation, used, len(fate))
-
-    def _view(self, image: Array32, R: Array, p: Array) -> tuple[Array32, Array, Array, tuple[Array, Array], Array]:
-        return image, R, p, self._mount, self._intrinsics
+        q, c = self._patches, self._direct
+        patches = (q.centres, q.tangents, q.rays, q.pictures, q.energy, q.slopes, q.inverse)
+        grey = (c.sigma_grey, c.correlated_px, c.min_correlation, float(q.pictures.shape[2]))
+        trust = (grey, c.sigma_depth_m**2, c.sigma_px**2, c.cauchy, gate)
+        used = linearise(patches, level, images[level], pose, self._mount, self._intrinsics, trust, H, g, fate)
+        return Normal(pose[0].copy(), pose[1].copy(), H / c.inflation, g / c.inflation, used, len(q))
 
     def _refill(
         self, pixels: Bytes2D, images: list[Array32], filter_: Filter, target: PointMap, planes: PlaneConfig
@@ -120,9 +114,7 @@ class DirectCamera:
         origin, rays = self._ground.rays(corners, state)
         per_px = (state.R @ self._mount[0])[:, :2] / self._intrinsics[0]
         view = (origin, rays[good], per_px)
-        new = cut(
-            images, corners[good], (anchors[good], found[good]), view, self._direct.half_px, self._direct.sigma_depth_m
-        )
+        new = cut(images, corners[good], (anchors[good], found[good]), view, self._direct.half_px)
         new = new.only(new.energy[:, 0] > 0.0)
         self.renewed = len(new) / max(len(self._patches) + len(new), 1)
         self._patches = self._patches.joined(new)

@@ -26,9 +26,6 @@ class DirectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     correlated_px: Positive = 4.0  # pixels that count as one: smoothing and interpolation correlate them
     sigma_depth_m: NotNegative = 0.03  # of a patch along the ray on which it was first seen
     sigma_px: Positive = 0.5  # of a patch, whatever its grey levels say
-    learns_depth: bool = True
-    depth_px: Positive = 1.0
-    least_depth_m: Positive = 0.005
     min_correlation: Annotated[float, msgspec.Meta(gt=0, lt=1)] = (
         0.7  # of a patch with its picture: less is another thing
     )

@@ -36,16 +36,10 @@ class Patches:
     energy: Array  # (N, L), sum of squares of the picture
     slopes: Array  # (N, L, n, 2), grey levels per pixel of the level, gain and offset projected out
     inverse: Array  # (N, L, 2, 2), of the slopes' Gram matrix
-    variance: Array  # (N,), m2, of the depth along the ray
     misses: Array  # (N,), images in a row in which it was not found
 
     def __len__(self) -> int:
         return len(self.centres)
-
-    @property
-    def arrays(self) -> tuple[Array, ...]:
-        """All but `misses`, for kernels."""
-        return tuple(getattr(self, f.name) for f in fields(self)[:-1])
 
     def only(self, which: Flags) -> Patches:
         """Those of a mask (N,)."""
@@ -60,7 +54,7 @@ class Patches:
 def no_patches(levels: int, half_px: int) -> Patches:
     """Zero of them."""
     n = (2 * half_px + 1) ** 2
-    shapes = ((3,), (3, 2), (3,), (levels, n), (levels,), (levels, n, 2), (levels, 2, 2), (), ())
+    shapes = ((3,), (3, 2), (3,), (levels, n), (levels,), (levels, n, 2), (levels, 2, 2), ())
     return Patches(*(np.empty((0, *shape)) for shape in shapes))
 
 
@@ -79,7 +73,6 @@ def cut(
     anchors: tuple[Array, Array],
     view: tuple[Array, Array, Array],
     half_px: int,
-    sigma_m: float,
 ) -> Patches:
     """New patches around OpenCV pixels (N, 2).
 
@@ -94,17 +87,7 @@ def cut(
         at = (corners.astype(np.float64) + 0.5) * 0.5**level - 0.5
         _cut(image, at, half_px, level, pictures, energy, slopes, inverse)
     tangents = _tangents(centres - origin, planes[:, :3], rays, per_px)
-    return Patches(
-        centres,
-        tangents,
-        rays,
-        pictures,
-        energy,
-        slopes,
-        inverse,
-        np.full(len(corners), sigma_m**2),
-        np.zeros(len(corners)),
-    )
+    return Patches(centres, tangents, rays, pictures, energy, slopes, inverse, np.zeros(len(corners)))
 
 
 def _tangents(sight: Array, normals: Array, rays: Array, per_px: Array) -> Array:

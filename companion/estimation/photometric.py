@@ -77,6 +77,14 @@ def compare(image, x, y, A, picture, slopes, sums):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
+def spacing(Q, tangents, A):  # type: ignore[no-untyped-def]
+    """A (2, 2): pixels of this image per pixel of the image of birth."""
+    for a in range(2):
+        for c in range(2):
+            A[a, c] = Q[a, 0] * tangents[0, c] + Q[a, 1] * tangents[1, c] + Q[a, 2] * tangents[2, c]
+
+
+@njit(cache=True, nogil=True)
 def measure(A, step, inverse, sums, energy, trust, residual, C):  # type: ignore[no-untyped-def]
     """Pixel minus projection (2,) in the full image, and its covariance C (2, 2) from grey levels; False: unlike.
 
@@ -122,82 +130,38 @@ def add(J, residual, C, cauchy, gate, H, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def look(patches, q, level, view, grey, scratch):  # type: ignore[no-untyped-def]
-    """Where patch q lies against where the pose puts it, into `scratch`; OUTSIDE, MISSED or FOUND.
-
-    `scratch`: J (2, 6), Q (2, 3), A and C (2, 2), pixel, residual and slip (2,: pixels per m of depth), sums (4,).
-    """
-    centres, tangents, rays, pictures, energy, slopes, inverse, _ = patches
-    image, R, p, mount, intrinsics = view
-    J, Q, A, C, pixel, residual, slip, sums = scratch
-    if energy[q, level] <= 0.0 or project(centres[q], R, p, mount, intrinsics, pixel, J, Q) < NEAREST_M:
-        return OUTSIDE
-    for a in range(2):
-        for c in range(2):
-            A[a, c] = Q[a, 0] * tangents[q, 0, c] + Q[a, 1] * tangents[q, 1, c] + Q[a, 2] * tangents[q, 2, c]
-        slip[a] = Q[a, 0] * rays[q, 0] + Q[a, 1] * rays[q, 1] + Q[a, 2] * rays[q, 2]
-    step = 2.0**level
-    x, y = pixel[0] / step - 0.5, pixel[1] / step - 0.5
-    if not compare(image, x, y, A, pictures[q, level], slopes[q, level], sums):
-        return OUTSIDE
-    found = measure(A, step, inverse[q, level], sums, energy[q, level], grey, residual, C)
-    return FOUND if found else MISSED
-
-
-@njit(cache=True, nogil=True)
-def new_scratch():  # type: ignore[no-untyped-def]
-    """For `look`."""
-    small = np.empty((2, 2, 2))
-    pairs = np.empty((3, 2))
-    return np.empty((2, 6)), np.empty((2, 3)), small[0], small[1], pairs[0], pairs[1], pairs[2], np.empty(4)
-
-
-@njit(cache=True, nogil=True)
-def linearise(patches, level, view, trust, H, g, fate):  # type: ignore[no-untyped-def]
+def linearise(patches, level, image, pose, mount, intrinsics, trust, H, g, fate):  # type: ignore[no-untyped-def]
     """Normal equations 0.5 dx' H dx - g' dx of dx = (theta_body, p_odom); returns how many patches were used.
 
-    `patches`: centres, tangents, rays, pictures, energy, slopes, inverse, variance of depth; `view`: the level's image, R, p,
-    mount and intrinsics; `trust`: of grey levels, floor (px2), Cauchy's constant, gate; `fate` (N,): of each patch.
+    `patches`: centres, tangents, rays, pictures, energy, slopes, inverse; `trust`: of grey levels, of depth (variance,
+    m2) and of the pixel (variance, px2), Cauchy's constant, gate; `fate` (N,): what became of each.
     """
-    grey, floor, cauchy, gate = trust
-    scratch = new_scratch()
-    J, _, _, C, _, residual, slip, _ = scratch
+    centres, tangents, rays, pictures, energy, slopes, inverse = patches
+    grey, depth_variance, floor, cauchy, gate = trust
+    R, p = pose
+    J, Q, A, C = np.empty((2, 6)), np.empty((2, 3)), np.empty((2, 2)), np.empty((2, 2))
+    pixel, residual, sums = np.empty(2), np.empty(2), np.empty(4)
+    step = 2.0**level
     H[:], g[:] = 0.0, 0.0
     used = 0
-    for q in range(fate.shape[0]):
-        fate[q] = look(patches, q, level, view, grey, scratch)
-        if fate[q] != FOUND:
+    for q in range(centres.shape[0]):
+        fate[q] = OUTSIDE
+        if energy[q, level] <= 0.0 or project(centres[q], R, p, mount, intrinsics, pixel, J, Q) < NEAREST_M:
+            continue
+        spacing(Q, tangents[q], A)
+        x, y = pixel[0] / step - 0.5, pixel[1] / step - 0.5
+        if not compare(image, x, y, A, pictures[q, level], slopes[q, level], sums):
+            continue
+        fate[q] = MISSED
+        if not measure(A, step, inverse[q, level], sums, energy[q, level], grey, residual, C):
             continue
         for a in range(2):
+            slip_a = Q[a, 0] * rays[q, 0] + Q[a, 1] * rays[q, 1] + Q[a, 2] * rays[q, 2]
             C[a, a] += floor
             for c in range(2):
-                C[a, c] += patches[7][q] * slip[a] * slip[c]
+                slip_c = Q[c, 0] * rays[q, 0] + Q[c, 1] * rays[q, 1] + Q[c, 2] * rays[q, 2]
+                C[a, c] += depth_variance * slip_a * slip_c
         if add(J, residual, C, cauchy, gate, H, g):
+            fate[q] = FOUND
             used += 1
-        else:
-            fate[q] = MISSED
     return used
-
-
-@njit(cache=True, nogil=True)
-def learn_depths(patches, view, grey, floor, least):  # type: ignore[no-untyped-def]
-    """Depths along the rays of birth by what is left of each patch's residual at the pose: a Kalman filter per patch.
-
-    `floor` (px2): of a residual beside its grey levels; `least` (m2): no variance goes below it.
-    """
-    centres, rays, variance = patches[0], patches[2], patches[7]
-    scratch = new_scratch()
-    C, residual, slip = scratch[3], scratch[5], scratch[6]
-    for q in range(variance.shape[0]):
-        if look(patches, q, 0, view, grey, scratch) != FOUND:
-            continue
-        c00, c01, c11 = C[0, 0] + floor, C[0, 1], C[1, 1] + floor
-        det = c00 * c11 - c01 * c01
-        w0, w1 = (c11 * slip[0] - c01 * slip[1]) / det, (c00 * slip[1] - c01 * slip[0]) / det
-        left = 1.0 / (1.0 / variance[q] + w0 * slip[0] + w1 * slip[1])
-        off = left * (w0 * residual[0] + w1 * residual[1])
-        if off * off > 9.0 * variance[q]:
-            continue
-        for i in range(3):
-            centres[q, i] += off * rays[q, i]
-        variance[q] = max(left, least)
