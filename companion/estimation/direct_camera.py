@@ -96,12 +96,12 @@ class DirectCamera:
         self, images: list[Array32], level: int, pose: tuple[Array, Array], gate: float, fate: NDArray[np.int8]
     ) -> Normal:
         H, g = np.empty((6, 6)), np.empty(6)
-        q, c = self._patches, self._direct
-        patches = (q.centres, q.tangents, q.rays, q.pictures, q.energy, q.slopes, q.inverse)
-        grey = (c.sigma_grey, c.correlated_px, c.min_correlation, float(q.pictures.shape[2]))
+        c = self._direct
+        grey = (c.sigma_grey, c.correlated_px, c.min_correlation, float((2 * c.half_px + 1) ** 2))
         trust = (grey, c.sigma_depth_m**2, c.sigma_px**2, c.cauchy, gate)
-        used = linearise(patches, level, images[level], pose, self._mount, self._intrinsics, trust, H, g, fate)
-        return Normal(pose[0].copy(), pose[1].copy(), H / c.inflation, g / c.inflation, used, len(q))
+        view = (images[level], *pose, self._mount, self._intrinsics)
+        used = linearise(self._patches.arrays, level, view, trust, H, g, fate)
+        return Normal(pose[0].copy(), pose[1].copy(), H / c.inflation, g / c.inflation, used, len(fate))
 
     def _refill(
         self, pixels: Bytes2D, images: list[Array32], filter_: Filter, target: PointMap, planes: PlaneConfig

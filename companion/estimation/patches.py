@@ -41,6 +41,11 @@ class Patches:
     def __len__(self) -> int:
         return len(self.centres)
 
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All but `misses`, for kernels."""
+        return tuple(getattr(self, f.name) for f in fields(self)[:-1])
+
     def only(self, which: Flags) -> Patches:
         """Those of a mask (N,)."""
         return Patches(*(np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)))

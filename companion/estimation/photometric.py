@@ -77,14 +77,6 @@ def compare(image, x, y, A, picture, slopes, sums):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def spacing(Q, tangents, A):  # type: ignore[no-untyped-def]
-    """A (2, 2): pixels of this image per pixel of the image of birth."""
-    for a in range(2):
-        for c in range(2):
-            A[a, c] = Q[a, 0] * tangents[0, c] + Q[a, 1] * tangents[1, c] + Q[a, 2] * tangents[2, c]
-
-
-@njit(cache=True, nogil=True)
 def measure(A, step, inverse, sums, energy, trust, residual, C):  # type: ignore[no-untyped-def]
     """Pixel minus projection (2,) in the full image, and its covariance C (2, 2) from grey levels; False: unlike.
 
@@ -130,38 +122,50 @@ def add(J, residual, C, cauchy, gate, H, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def linearise(patches, level, image, pose, mount, intrinsics, trust, H, g, fate):  # type: ignore[no-untyped-def]
-    """Normal equations 0.5 dx' H dx - g' dx of dx = (theta_body, p_odom); returns how many patches were used.
+def look(patches, q, level, view, grey, scratch):  # type: ignore[no-untyped-def]
+    """Where patch q lies against where the pose puts it, into `scratch`; OUTSIDE, MISSED or FOUND.
 
-    `patches`: centres, tangents, rays, pictures, energy, slopes, inverse; `trust`: of grey levels, of depth (variance,
-    m2) and of the pixel (variance, px2), Cauchy's constant, gate; `fate` (N,): what became of each.
+    `scratch`: J (2, 6), Q (2, 3), A and C (2, 2), pixel, residual and slip (2,: pixels per m of depth), sums (4,).
     """
     centres, tangents, rays, pictures, energy, slopes, inverse = patches
-    grey, depth_variance, floor, cauchy, gate = trust
-    R, p = pose
-    J, Q, A, C = np.empty((2, 6)), np.empty((2, 3)), np.empty((2, 2)), np.empty((2, 2))
-    pixel, residual, sums = np.empty(2), np.empty(2), np.empty(4)
+    image, R, p, mount, intrinsics = view
+    J, Q, A, C, pixel, residual, slip, sums = scratch
+    if energy[q, level] <= 0.0 or project(centres[q], R, p, mount, intrinsics, pixel, J, Q) < NEAREST_M:
+        return OUTSIDE
+    for a in range(2):
+        for c in range(2):
+            A[a, c] = Q[a, 0] * tangents[q, 0, c] + Q[a, 1] * tangents[q, 1, c] + Q[a, 2] * tangents[q, 2, c]
+        slip[a] = Q[a, 0] * rays[q, 0] + Q[a, 1] * rays[q, 1] + Q[a, 2] * rays[q, 2]
     step = 2.0**level
+    x, y = pixel[0] / step - 0.5, pixel[1] / step - 0.5
+    if not compare(image, x, y, A, pictures[q, level], slopes[q, level], sums):
+        return OUTSIDE
+    found = measure(A, step, inverse[q, level], sums, energy[q, level], grey, residual, C)
+    return FOUND if found else MISSED
+
+
+@njit(cache=True, nogil=True)
+def linearise(patches, level, view, trust, H, g, fate):  # type: ignore[no-untyped-def]
+    """Normal equations 0.5 dx' H dx - g' dx of dx = (theta_body, p_odom); returns how many patches were used.
+
+    `patches`: as in `Patches`, without `misses`; `view`: the level's image, R, p, mount, intrinsics; `trust`: of grey
+    levels, of depth (variance, m2) and of the pixel (variance, px2), Cauchy's constant, gate; `fate` (N,): of each.
+    """
+    grey, depth_variance, floor, cauchy, gate = trust
+    J, C, residual, slip = np.empty((2, 6)), np.empty((2, 2)), np.empty(2), np.empty(2)
+    scratch = (J, np.empty((2, 3)), np.empty((2, 2)), C, np.empty(2), residual, slip, np.empty(4))
     H[:], g[:] = 0.0, 0.0
     used = 0
-    for q in range(centres.shape[0]):
-        fate[q] = OUTSIDE
-        if energy[q, level] <= 0.0 or project(centres[q], R, p, mount, intrinsics, pixel, J, Q) < NEAREST_M:
-            continue
-        spacing(Q, tangents[q], A)
-        x, y = pixel[0] / step - 0.5, pixel[1] / step - 0.5
-        if not compare(image, x, y, A, pictures[q, level], slopes[q, level], sums):
-            continue
-        fate[q] = MISSED
-        if not measure(A, step, inverse[q, level], sums, energy[q, level], grey, residual, C):
+    for q in range(fate.shape[0]):
+        fate[q] = look(patches, q, level, view, grey, scratch)
+        if fate[q] != FOUND:
             continue
         for a in range(2):
-            slip_a = Q[a, 0] * rays[q, 0] + Q[a, 1] * rays[q, 1] + Q[a, 2] * rays[q, 2]
             C[a, a] += floor
             for c in range(2):
-                slip_c = Q[c, 0] * rays[q, 0] + Q[c, 1] * rays[q, 1] + Q[c, 2] * rays[q, 2]
-                C[a, c] += depth_variance * slip_a * slip_c
+                C[a, c] += depth_variance * slip[a] * slip[c]
         if add(J, residual, C, cauchy, gate, H, g):
-            fate[q] = FOUND
             used += 1
+        else:
+            fate[q] = MISSED
     return used
