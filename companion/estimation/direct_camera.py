@@ -47,12 +47,12 @@ class DirectCamera:
             return None
         self._bad_images = 0
         images = pyramid(pixels, self._direct.levels, self._direct.smooth_px)
-        if len(self._patches) >= self._direct.min_patches:
-            normal = self._correct(images, filter_)
+        least = max(self._direct.min_patches, round(self._direct.min_share * len(self._patches)))
+        if len(self._patches) >= least:
+            normal = self._correct(images, filter_, least)
         if len(self._patches) < self._direct.refill_below:
             self._refill(pixels, images, filter_, target, planes)
-        used = normal is not None and normal.used >= self._direct.min_patches
-        return normal if used else None
+        return normal if normal is not None and normal.used >= least else None
 
     def forget(self) -> None:
         """Drop all patches: the next image begins new ones."""
@@ -63,7 +63,7 @@ class DirectCamera:
         if self._bad_images > self._direct.keep_images:
             self.forget()
 
-    def _correct(self, images: list[Array32], filter_: Filter) -> Normal:
+    def _correct(self, images: list[Array32], filter_: Filter, least: int) -> Normal:
         c = self._direct
         gates = iter([c.first_gate])
         fate = np.zeros(len(self._patches), np.int8)
@@ -71,21 +71,21 @@ class DirectCamera:
         def finest(R: Array, p: Array) -> Normal:
             return self._linearise(images, 0, (R, p), next(gates, c.gate), fate)
 
-        begin = self._coarse(images, filter_)
-        normal = filter_.update(finest, iterations=c.iterations, at_least=c.min_patches, begin=begin)
+        begin = self._coarse(images, filter_, least)
+        normal = filter_.update(finest, iterations=c.iterations, at_least=least, begin=begin)
         self._patches.misses = np.where(fate == FOUND, 0.0, self._patches.misses + 1.0)
         alive = (fate == FOUND) | ((fate == MISSED) & (self._patches.misses < c.misses))
         self._patches = self._patches.only(alive)
         return normal
 
-    def _coarse(self, images: list[Array32], filter_: Filter) -> tuple[Array, Array]:
+    def _coarse(self, images: list[Array32], filter_: Filter, least: int) -> tuple[Array, Array]:
         """One step at each coarser level from the prior, so that the finest begins within a pixel or two."""
         R, p = filter_.state.R.copy(), filter_.state.p.copy()
         prior = np.linalg.inv(filter_.P[:6, :6])
         fate = np.zeros(len(self._patches), np.int8)
         for level in range(len(images) - 1, 0, -1):
             normal = self._linearise(images, level, (R, p), self._direct.first_gate, fate)
-            if normal.used < self._direct.min_patches:
+            if normal.used < least:
                 continue
             off = np.concatenate([log_so3(filter_.state.R.T @ R), p - filter_.state.p])
             step = np.linalg.solve(prior + normal.H, normal.g - prior @ off)

@@ -17,6 +17,7 @@ class DirectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     patches: Count = 80  # at most
     refill_below: Count = 50  # look for new ones when fewer are left
     min_patches: Annotated[int, msgspec.Meta(ge=4)] = 8
+    min_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.3  # of the patches that must be found: some fit by chance
     half_px: Annotated[int, msgspec.Meta(ge=2, le=10)] = 4  # a patch has (2 half_px + 1)^2 pixels
     levels: Annotated[int, msgspec.Meta(ge=1, le=5)] = 3  # of the pyramid, each half as large as the one before
     smooth_px: Positive = 0.8  # sigma of what is smoothed before
@@ -24,8 +25,8 @@ class DirectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     corner_quality: Positive = 0.02  # smallest eigenvalue of a patch's slopes against the best of the image
     sigma_grey: Positive = 2.0  # at least, of a smoothed grey level
     correlated_px: Positive = 4.0  # pixels that count as one: smoothing and interpolation correlate them
-    sigma_depth_m: NotNegative = 0.03  # of a patch along the ray on which it was first seen
-    sigma_px: Positive = 0.5  # of a patch, whatever its grey levels say
+    sigma_depth_m: NotNegative = 0.05  # of a patch along the ray on which it was first seen
+    sigma_px: Positive = 0.2  # of a patch, whatever its grey levels say
     min_correlation: Annotated[float, msgspec.Meta(gt=0, lt=1)] = (
         0.7  # of a patch with its picture: less is another thing
     )
@@ -33,6 +34,6 @@ class DirectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     cauchy: Positive = 9.0
     first_gate: Positive = 400.0  # chi2 of the first iteration
     gate: Positive = 100.0  # of the others
-    inflation: Positive = 4.0  # patches are not independent: information is divided by it
+    inflation: Positive = 16.0  # patches are not independent: information is divided by it
     iterations: Count = 4  # at the finest level; one at each of the others
     keep_images: Count = 15  # bad images that the patches outlive
