@@ -19,7 +19,7 @@ from companion.estimation.filter import Filter
 from companion.estimation.ground_rays import GroundRays
 from companion.estimation.image_gate import ImageGate
 from companion.estimation.patches import cut, no_patches, pyramid
-from companion.estimation.photometric import FOUND, MISSED, linearise
+from companion.estimation.photometric import FOUND, MISSED, SHARED, linearise
 from companion.estimation.point_map import PointMap
 from companion.estimation.registration import Normal, PlaneConfig
 
@@ -95,13 +95,16 @@ class DirectCamera:
     def _linearise(
         self, images: list[Array32], level: int, pose: tuple[Array, Array], gate: float, fate: NDArray[np.int8]
     ) -> Normal:
-        H, g = np.empty((6, 6)), np.empty(6)
+        H, g = np.empty((SHARED, SHARED)), np.empty(SHARED)
         c = self._direct
         grey = (c.sigma_grey, c.correlated_px, c.min_correlation, float((2 * c.half_px + 1) ** 2))
         trust = (grey, c.sigma_depth_m**2, c.sigma_px**2, c.cauchy, gate)
         view = (images[level], *pose, self._mount, self._intrinsics)
         used = linearise(self._patches.arrays, level, view, trust, H, g, fate)
-        return Normal(pose[0].copy(), pose[1].copy(), H / c.inflation, g / c.inflation, used, len(fate))
+        ground = np.array([c.sigma_height_m, c.sigma_slope, c.sigma_slope])
+        return Normal(
+            pose[0].copy(), pose[1].copy(), *_marginal(H / c.inflation, g / c.inflation, ground), used, len(fate)
+        )
 
     def _refill(
         self, pixels: Bytes2D, images: list[Array32], filter_: Filter, target: PointMap, planes: PlaneConfig
@@ -143,3 +146,9 @@ class DirectCamera:
         optical = ((self._patches.centres - filter_.state.p) @ filter_.state.R - p_cam) @ R_body_cam
         scale = self._intrinsics[0] / np.maximum(optical[:, 2], 0.1)
         return np.asarray(optical[:, :2] * scale[:, None] + self._intrinsics[1:] - 0.5)
+
+
+def _marginal(H: Array, g: Array, sigmas: Array) -> tuple[Array, Array]:
+    """Normal equations of the first six unknowns, the others known to `sigmas` about zero (Schur)."""
+    across = np.linalg.solve(H[6:, 6:] + np.diag(sigmas**-2.0), H[6:, :6]).T
+    return H[:6, :6] - across @ H[6:, :6], g[:6] - across @ g[6:]

@@ -14,6 +14,7 @@ from numba import njit
 from companion.estimation.patches import grey_at
 
 NEAREST_M = 0.2
+SHARED = 9  # what all patches depend on: the pose (6), and how the ground as a whole is off (3)
 OUTSIDE, MISSED, FOUND = 0, 1, 2  # what became of a patch
 
 
@@ -112,11 +113,11 @@ def add(J, residual, C, cauchy, gate, H, g):  # type: ignore[no-untyped-def]
         return False
     root = cauchy / (cauchy + chi2)
     weight = root * root
-    for i in range(6):
+    for i in range(SHARED):
         left0 = weight * (w00 * J[0, i] + w01 * J[1, i])
         left1 = weight * (w01 * J[0, i] + w11 * J[1, i])
         g[i] += left0 * ru + left1 * rv
-        for j in range(6):
+        for j in range(SHARED):
             H[i, j] += left0 * J[0, j] + left1 * J[1, j]
     return True
 
@@ -146,13 +147,15 @@ def look(patches, q, level, view, grey, scratch):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True)
 def linearise(patches, level, view, trust, H, g, fate):  # type: ignore[no-untyped-def]
-    """Normal equations 0.5 dx' H dx - g' dx of dx = (theta_body, p_odom); returns how many patches were used.
+    """Normal equations 0.5 dx' H dx - g' dx of dx = (theta_body, p_odom, ground); returns how many patches were used.
+
+    ground (3,): the height by which the surface is off under the vehicle, m, and its slopes along x and y of odom.
 
     `patches`: as in `Patches`, without `misses`; `view`: the level's image, R, p, mount, intrinsics; `trust`: of grey
     levels, of depth (variance, m2) and of the pixel (variance, px2), Cauchy's constant, gate; `fate` (N,): of each.
     """
     grey, depth_variance, floor, cauchy, gate = trust
-    J, C, residual, slip = np.empty((2, 6)), np.empty((2, 2)), np.empty(2), np.empty(2)
+    J, C, residual, slip = np.empty((2, SHARED)), np.empty((2, 2)), np.empty(2), np.empty(2)
     scratch = (J, np.empty((2, 3)), np.empty((2, 2)), C, np.empty(2), residual, slip, np.empty(4))
     H[:], g[:] = 0.0, 0.0
     used = 0
@@ -164,6 +167,9 @@ def linearise(patches, level, view, trust, H, g, fate):  # type: ignore[no-untyp
             C[a, a] += floor
             for c in range(2):
                 C[a, c] += depth_variance * slip[a] * slip[c]
+            J[a, 6] = slip[a] / patches[2][q, 2]  # the ray comes down by as much as the ground is higher
+            J[a, 7] = J[a, 6] * (patches[0][q, 0] - view[2][0])
+            J[a, 8] = J[a, 6] * (patches[0][q, 1] - view[2][1])
         if add(J, residual, C, cauchy, gate, H, g):
             used += 1
         else:
