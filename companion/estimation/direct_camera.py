@@ -7,6 +7,8 @@ they fit. Sources: J. Engel et al., "Direct sparse odometry", PAMI 2018; C. Fors
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +27,15 @@ from companion.estimation.registration import Normal, PlaneConfig
 
 
 class DirectCamera:
-    """Patches (picture, place in odom) of the images before; the same interface as `CameraTracker`."""
+    """Patches (picture, place in odom) of the images before; the same interface as `CameraTracker`.
 
-    def __init__(self, config: CameraConfig, rig: Rig) -> None:
-        self.config, self._direct = config, config.direct
+    `lidar_hold`: `Normal.weakest` of the newest sweep, 0 while there is none. Patches lie where the pose had them, so
+    they are as wrong as it was: against a LiDAR that holds every axis they must not insist.
+    """
+
+    def __init__(self, config: CameraConfig, rig: Rig, lidar_hold: Callable[[], float]) -> None:
+        self.config, self._direct, self._lidar_hold = config, config.direct, lidar_hold
+        self._inflation = config.direct.inflation
         self._mount = (np.ascontiguousarray(rig.camera.R_body_sensor), rig.camera.p_body)
         self._intrinsics = np.array([rig.pinhole.focal_px, *rig.pinhole.center_px])
         self._ground = GroundRays(rig, depth_m=(config.min_depth_m, config.max_depth_m))
@@ -46,6 +53,7 @@ class DirectCamera:
             self._outlive()
             return None
         self._bad_images = 0
+        self._inflation = self._direct.inflation * (1.0 + (self._lidar_hold() / self._direct.yield_above) ** 2)
         images = pyramid(pixels, self._direct.levels, self._direct.smooth_px)
         least = max(self._direct.min_patches, round(self._direct.min_share * len(self._patches)))
         if len(self._patches) >= least:
@@ -103,7 +111,11 @@ class DirectCamera:
         used = linearise(self._patches.arrays, level, view, trust, H, g, fate)
         ground = np.array([c.sigma_height_m, c.sigma_slope, c.sigma_slope])
         return Normal(
-            pose[0].copy(), pose[1].copy(), *_marginal(H / c.inflation, g / c.inflation, ground), used, len(fate)
+            pose[0].copy(),
+            pose[1].copy(),
+            *_marginal(H / self._inflation, g / self._inflation, ground),
+            used,
+            len(fate),
         )
 
     def _refill(

@@ -25,17 +25,18 @@ class DirectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     corner_quality: Positive = 0.02  # smallest eigenvalue of a patch's slopes against the best of the image
     sigma_grey: Positive = 2.0  # at least, of a smoothed grey level
     correlated_px: Positive = 4.0  # pixels that count as one: smoothing and interpolation correlate them
-    sigma_depth_m: NotNegative = 0.015  # of a patch along the ray on which it was first seen
+    sigma_depth_m: NotNegative = 0.02  # of a patch along the ray on which it was first seen
     sigma_height_m: Positive = 0.01  # of the surface as a whole
     sigma_slope: Positive = 0.002  # of the surface as a whole, against the vehicle's attitude
     sigma_px: Positive = 0.1  # of a patch, whatever its grey levels say
-    min_correlation: Annotated[float, msgspec.Meta(gt=0, lt=1)] = (
-        0.7  # of a patch with its picture: less is another thing
-    )
+    min_correlation: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.7  # with its picture: less is another thing
     misses: Count = 3  # images in a row without it, and a patch goes
     cauchy: Positive = 9.0
     first_gate: Positive = 400.0  # chi2 of the first iteration
     gate: Positive = 100.0  # of the others
     inflation: Positive = 4.0  # patches are not independent: information is divided by it
+    yield_above: Positive = (
+        0.01  # smallest eigenvalue of a sweep's scaled information at which it is divided by two more
+    )
     iterations: Count = 4  # at the finest level; one at each of the others
     keep_images: Count = 15  # bad images that the patches outlive

@@ -81,7 +81,8 @@ class Lio:
         self._thinner = Thinner()
         self._densities = config.noise.densities
         self._standing = Standing(start, config.standing)
-        self._tracker = _camera_of(camera or CameraConfig(), rig)
+        self._swept: Normal | None = None  # what the newest sweep said
+        self._tracker = self._camera_of(camera or CameraConfig(), rig)
 
     @classmethod
     def at_rest(cls, samples: Array, config: LioConfig, rig: Rig, camera: CameraConfig | None = None) -> Lio:
@@ -151,6 +152,14 @@ class Lio:
             self._track_error.extend(self.filter.state, self.filter.P, share)
         return normal
 
+    def _camera_of(self, config: CameraConfig, rig: Rig) -> CameraTracker | DirectCamera:
+        return DirectCamera(config, rig, self._hold) if config.method == "direct" else CameraTracker(config, rig)
+
+    def _hold(self) -> float:
+        """How well the newest sweep holds its blindest axis (`Normal.weakest`); 0 while sweeps are out."""
+        out = self.filter.t_s - self._scan_s > self.config.lidar_out_s
+        return 0.0 if out or self._swept is None else self._swept.weakest
+
     def _register(self, points_body: Array32) -> Normal | None:
         """What the sweep said; None: it came after a gap, does not fit the map, and corrected nothing."""
         self._take_back_track_error()
@@ -166,6 +175,7 @@ class Lio:
             return None
         move_nodes(self._nodes, before, self._pose())
         self._standing.seen(normal)
+        self._swept = normal
         self._imu_doubt.corrected(self.filter)
         return normal
 
@@ -220,7 +230,3 @@ class Lio:
     def _pose(self) -> tuple[Array, Array, Array]:
         state = self.filter.state
         return state.R.copy(), state.p.copy(), state.v.copy()
-
-
-def _camera_of(config: CameraConfig, rig: Rig) -> CameraTracker | DirectCamera:
-    return DirectCamera(config, rig) if config.method == "direct" else CameraTracker(config, rig)

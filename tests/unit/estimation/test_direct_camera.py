@@ -65,9 +65,9 @@ def filter_at(pose, *, turn_rad=0.05, shift_m=0.15):
     return Filter(state, P, 0.0)
 
 
-def begun(ground, plain):
+def begun(ground, plain, lidar_hold=lambda: 0.0):
     """A camera that has seen the ground from FIRST."""
-    camera = DirectCamera(CameraConfig(method="direct"), RIG)
+    camera = DirectCamera(CameraConfig(method="direct"), RIG, lidar_hold)
     assert camera.update(picture(ground, FIRST), filter_at(FIRST), plain, PlaneConfig()) is None
     return camera
 
