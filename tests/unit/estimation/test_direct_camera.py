@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import Rotation
 
@@ -15,7 +16,7 @@ from companion.core.rig import Rig
 from companion.estimation import patches, photometric
 from companion.estimation.camera import CameraConfig
 from companion.estimation.config import EstimationConfig
-from companion.estimation.direct_camera import DirectCamera
+from companion.estimation.direct_camera import DirectCamera, _marginal
 from companion.estimation.filter import Filter
 from companion.estimation.lio_node import LioNode
 from companion.estimation.point_map import PointMap, PointMapConfig
@@ -211,17 +212,43 @@ def test_another_place_moves_nothing(ground, plain):
     assert camera.update(picture(ground, far, seed=7), filter_, plain, PlaneConfig()).used > 40
 
 
-def test_information_is_honest_when_depths_are_wrong(ground, plain):
-    """Depths off by their sigma, each its own: NEES per degree of freedom of the pose from the image alone."""
-    nees = []
-    for seed in range(12):
+def test_information_is_honest_when_the_map_is_wrong(ground, plain):
+    """Depths off by their sigmas, each and all together: NEES per degree of freedom of the pose by the image alone."""
+    nees, c = [], CameraConfig().direct
+    for seed in range(15):
         camera, rng = begun(ground, plain), np.random.default_rng(seed)
         q, filter_ = camera._patches, filter_at(FIRST)
-        q.centres += q.rays * rng.normal(0, camera.config.direct.sigma_depth_m, (len(q), 1))
+        height, slopes = rng.normal(0, c.sigma_height_m), rng.normal(0, c.sigma_slope, 2)
+        together = (height + (q.centres[:, :2] - FIRST[1][:2]) @ slopes) / q.rays[:, 2]
+        q.centres += q.rays * (together + rng.normal(0, c.sigma_depth_m, len(q)))[:, None]
         normal = camera.update(picture(ground, SECOND, seed=seed), filter_, plain, PlaneConfig())
         off = error_of(filter_.state, SECOND)
         nees.append(off @ normal.H @ off / 6)
-    assert 0.2 / 16 < np.mean(nees) < 2.0  # the information is a sixteenth, since real errors are not independent
+    assert 0.3 < c.inflation * np.mean(nees) < 2.5
+
+
+def test_the_ground_as_a_whole_is_marginalised():
+    rng = np.random.default_rng(4)
+    S, truth, sigmas = rng.normal(size=(30, 9)), rng.normal(size=9), np.array([0.1, 0.2, 0.3])
+    H, g = S.T @ S, S.T @ S @ truth
+    joint = H + np.diag(np.concatenate([np.zeros(6), sigmas**-2]))
+    marginal, gradient = _marginal(H, g, sigmas)
+    np.testing.assert_allclose(np.linalg.inv(marginal), np.linalg.inv(joint)[:6, :6], atol=1e-9)
+    np.testing.assert_allclose(np.linalg.solve(marginal, gradient), np.linalg.solve(joint, g)[:6], atol=1e-9)
+
+
+def test_it_yields_to_a_lidar_that_holds_every_axis(ground, plain):
+    """Twice the inflation where a sweep's smallest eigenvalue is `yield_above`: never less than half is left."""
+    hold = [0.0]
+    camera, normals = begun(ground, plain, lambda: hold[0]), []
+    for seed, hold[0] in enumerate((0.0, CameraConfig().direct.yield_above)):
+        camera.update(picture(ground, FIRST, seed=3 + seed), filter_at(FIRST), plain, PlaneConfig())
+        images = patches.pyramid(picture(ground, SECOND, seed=1), 1, 0.8)
+        normals.append(camera._linearise(images, 0, SECOND, 100.0, np.zeros(len(camera._patches), np.int8)))
+    left = eigh(normals[1].H, normals[0].H, eigvals_only=True)
+    assert left[0] > 0.499
+    assert left[0] < 0.55
+    assert left[-1] < 1.0
 
 
 def test_same_bytes_twice_and_the_lidar_is_outdone():
