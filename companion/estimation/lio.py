@@ -16,6 +16,7 @@ import numpy as np
 
 from companion.core.messages import Array, Array32, Bytes2D
 from companion.core.rig import Rig
+from companion.estimation.blind_axes import BlindAxes, BlindAxesConfig, BlindDrift
 from companion.estimation.camera import CameraConfig, CameraTracker
 from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
 from companion.estimation.direct_camera import DirectCamera
@@ -47,7 +48,7 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     search: SearchConfig = SearchConfig()
     imu_doubt: ImuDoubtConfig = ImuDoubtConfig()
     weak_below: Annotated[float, msgspec.Meta(ge=0)] = 0.005  # normalised eigenvalue: such an axis is named
-    soften_below: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # the same, for what is left out without a camera
+    blind: BlindAxesConfig = BlindAxesConfig()
     camera_out_s: Annotated[float, msgspec.Meta(gt=0)] = 0.3  # without an image that was of use
     lidar_out_s: Annotated[float, msgspec.Meta(gt=0)] = 0.25  # without a sweep: camera anchors drift
     thin_m: Annotated[float, msgspec.Meta(gt=0)] = 0.5  # one point per voxel of this edge is registered
@@ -72,10 +73,11 @@ class Lio:
         self.filter, self.config = start, config
         self.map = PointMap(config.map)
         self._map_error, self._track_error = MapError(), MapError()
-        self._scan_s = start.t_s  # when the last sweep was used
-        self._image_s = -np.inf  # when the last image was of use
+        self._scan_s = self._looked_s = start.t_s  # when the last sweep was used, and came
         self._back_s: float | None = None  # when sweeps came back after a gap
         self._imu_doubt = ImuDoubt(config.imu_doubt)
+        self._blind, self._drift = BlindAxes(config.blind), BlindDrift(config.blind)
+        self._image_s = -np.inf  # when the last image was of use
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
         self._nodes = np.empty((0, NODE))
         self._thinner = Thinner()
@@ -122,7 +124,8 @@ class Lio:
     def covariance(self) -> Array:
         """Of the error state in odom, (18, 18): the filter's, and that of the map it measures against."""
         state = self.filter.state
-        return self.filter.P + self._map_error.covariance(state) + self._track_error.covariance(state)
+        maps = self._map_error.covariance(state) + self._track_error.covariance(state)
+        return self.filter.P + maps + self._drift.covariance
 
     @property
     def objection(self) -> str:
@@ -146,7 +149,7 @@ class Lio:
         normal = self._tracker.update(pixels, self.filter, self.map, self.config.plane)
         move_nodes(self._nodes, before, self._pose())
         self._image_s = self._image_s if normal is None else self.filter.t_s
-        if self.filter.t_s - self._scan_s > self.config.lidar_out_s:
+        if self.filter.t_s - self._scan_s > self.config.lidar_out_s or self._blind.shift is not None:
             self._track_error.move(self.filter.state.p)
             share = self._tracker.renewed * self.config.map_error.track_share
             self._track_error.extend(self.filter.state, self.filter.P, share)
@@ -162,7 +165,7 @@ class Lio:
 
     def _register(self, points_body: Array32) -> Normal | None:
         """What the sweep said; None: it came after a gap, does not fit the map, and corrected nothing."""
-        self._take_back_track_error()
+        self._take_back_drift()
         before, prior = self._pose(), (self.filter.state.copy(), self.filter.P)
         few = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
         scan = PlaneRegistration(self.map, few, self.config.plane)
@@ -176,14 +179,14 @@ class Lio:
         move_nodes(self._nodes, before, self._pose())
         self._standing.seen(normal)
         self._swept = normal
+        self._blind.seen()
         self._imu_doubt.corrected(self.filter)
         return normal
 
     def _softened(self, scan: PlaneRegistration) -> Linearise:
-        """What the scan says; without a camera, less of it along axes in which it is blind."""
-        if self.filter.t_s - self._image_s < self.config.camera_out_s:
-            return scan.linearise
-        return lambda R, p: scan.linearise(R, p).softened(self.config.soften_below)
+        """What the scan says, less of it along axes in which it is blind."""
+        P = (self.filter.P + self._drift.covariance)[:6, :6]
+        return lambda R, p: self._blind.soften(scan.linearise(R, p), P)
 
     def _found(self, points_body: Array) -> tuple[Array, Array] | None:
         """After a gap, where registration is to begin; None: where the filter is."""
@@ -206,10 +209,18 @@ class Lio:
             return True
         return scan.fit_within(state.R, state.p, c.fits_m) > c.agree_share
 
-    def _take_back_track_error(self) -> None:
-        """What the camera's own map may have drifted, a sweep can mend: it is the filter's to correct."""
-        self.filter.P = self.filter.P + self._track_error.covariance(self.filter.state)
-        self._track_error.reset()
+    def _take_back_drift(self) -> None:
+        """What camera or IMU alone may have drifted, a sweep that sees can mend: it is the filter's then."""
+        shift, dt_s = self._blind.shift, self.filter.t_s - self._looked_s
+        self._looked_s = self.filter.t_s
+        if shift is None:
+            self.filter.P = self.filter.P + self._track_error.covariance(self.filter.state)
+            self._track_error.reset()
+        if shift is not None and self.filter.t_s - self._image_s > self.config.camera_out_s:
+            self._drift.grow(shift, dt_s)
+        elif self._drift.C.any():
+            self.filter.P = self.filter.P + self._drift.covariance
+            self._drift.reset()
 
     def _extend(self, spaced: Array32) -> None:
         state = self.filter.state

@@ -21,7 +21,7 @@ from companion.estimation.voxels import pack, slot_of
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Flags = NDArray[np.bool_]
-_LEVER = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # 1/m: rotation counts by its effect 10 m away
+LEVER = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # 1/m: rotation counts by its effect 10 m away
 
 
 class PlaneConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -51,30 +51,18 @@ class Normal:
     @property
     def weakest(self) -> float:
         """Smallest eigenvalue of the scaled information, 0..1/3: near 0, a direction is blind."""
-        scale = float(np.trace(self.H[3:, 3:]))
-        return float(np.linalg.eigvalsh(_LEVER @ self.H @ _LEVER / scale)[0]) if scale > 0 else 0.0
+        return float(np.linalg.eigvalsh(LEVER @ self.H @ LEVER / self.scale)[0]) if self.scale > 0 else 0.0
 
-    def softened(self, below: float) -> Normal:
-        """Without what noise says along blind axes: w^4 / (w^4 + below^4) stays of an eigenvalue w of the scaled H.
-
-        Five noisy points of a plain make planes that lean at random, and their sum is no knowledge of the way along it.
-        """
-        scale = float(np.trace(self.H[3:, 3:]))
-        if scale <= 0 or below <= 0:
-            return self
-        values, vectors = np.linalg.eigh(_LEVER @ self.H @ _LEVER / scale)
-        kept = values**4 / (values**4 + below**4)
-        back = np.linalg.inv(_LEVER)
-        S = back @ (vectors * kept) @ vectors.T @ _LEVER
-        H = S @ self.H
-        return Normal(self.R, self.p, 0.5 * (H + H.T), S @ self.g, self.used, self.offered)
+    @property
+    def scale(self) -> float:
+        """Sum of the information on position, 1/m2: eigenvalues are compared with it."""
+        return float(np.trace(self.H[3:, 3:]))
 
     def weak_axes(self, below: float) -> list[str]:
         """Names of the directions in which it says hardly anything, in odom: an axis, or a turn about one."""
-        scale = float(np.trace(self.H[3:, 3:]))
-        if scale <= 0:
+        if self.scale <= 0:
             return ["every axis"]
-        values, vectors = np.linalg.eigh(_LEVER @ self.H @ _LEVER / scale)
+        values, vectors = np.linalg.eigh(LEVER @ self.H @ LEVER / self.scale)
         return [_named(v, self.R) for v in vectors[:, values < below].T]
 
 
