@@ -7,7 +7,7 @@ they fit. Sources: J. Engel et al., "Direct sparse odometry", PAMI 2018; C. Fors
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -41,6 +41,7 @@ class DirectCamera:
         self._ground = GroundRays(rig, depth_m=(config.min_depth_m, config.max_depth_m))
         self._gate = ImageGate(config.image)
         self._bad_images = 0  # in a row
+        self._seen = (0.0, np.zeros(3), np.zeros(3))  # time, position and velocity in odom at the last image
         self.forget()
         self.objection = ""  # to the last image
         self.renewed = 0.0  # share of the patches that the last image began
@@ -58,6 +59,7 @@ class DirectCamera:
         least = max(self._direct.min_patches, round(self._direct.min_share * len(self._patches)))
         if len(self._patches) >= least:
             normal = self._correct(images, filter_, least)
+        self._seen = (filter_.t_s, filter_.state.p.copy(), filter_.state.v.copy())
         if len(self._patches) < self._direct.refill_below:
             self._refill(pixels, images, filter_, target, planes)
         return normal if normal is not None and normal.used >= least else None
@@ -87,18 +89,33 @@ class DirectCamera:
         return normal
 
     def _coarse(self, images: list[Array32], filter_: Filter, least: int) -> tuple[Array, Array]:
-        """One step at each coarser level from the prior, so that the finest begins within a pixel or two."""
-        R, p = filter_.state.R.copy(), filter_.state.p.copy()
+        """Where the finest level begins: within a pixel or two, if the patches are known from one of the starts."""
+        for p in self._starts(filter_):
+            begin, found = self._descend(images, filter_, p)
+            if found >= least:
+                return begin
+        return filter_.state.R.copy(), filter_.state.p.copy()
+
+    def _starts(self, filter_: Filter) -> Iterator[Array]:
+        """Positions in odom: the prior's, and straight on from the last image, should a sweep have moved it far."""
+        yield filter_.state.p.copy()
+        t_s, p, v = self._seen
+        yield p + v * (filter_.t_s - t_s)
+
+    def _descend(self, images: list[Array32], filter_: Filter, p: Array) -> tuple[tuple[Array, Array], int]:
+        """One step at each coarser level; the pose, and how many patches the last of them found."""
+        R, state = filter_.state.R.copy(), filter_.state
         prior = np.linalg.inv(filter_.P[:6, :6])
         fate = np.zeros(len(self._patches), np.int8)
+        found = 0
         for level in range(len(images) - 1, 0, -1):
             normal = self._linearise(images, level, (R, p), self._direct.first_gate, fate)
-            if normal.used < least:
-                continue
-            off = np.concatenate([log_so3(filter_.state.R.T @ R), p - filter_.state.p])
-            step = np.linalg.solve(prior + normal.H, normal.g - prior @ off)
-            R, p = R @ exp_so3(step[:3]), p + step[3:]
-        return R, p
+            found = normal.used
+            if found >= self._direct.min_patches:
+                off = np.concatenate([log_so3(state.R.T @ R), p - state.p])
+                step = np.linalg.solve(prior + normal.H, normal.g - prior @ off)
+                R, p = R @ exp_so3(step[:3]), p + step[3:]
+        return (R, p), found
 
     def _linearise(
         self, images: list[Array32], level: int, pose: tuple[Array, Array], gate: float, fate: NDArray[np.int8]
@@ -106,7 +123,8 @@ class DirectCamera:
         H, g = np.empty((SHARED, SHARED)), np.empty(SHARED)
         c = self._direct
         grey = (c.sigma_grey, c.correlated_px, c.min_correlation, float((2 * c.half_px + 1) ** 2))
-        trust = (grey, c.sigma_depth_m**2, c.sigma_px**2, c.cauchy, gate)
+        floor = (c.sigma_px * 4.0**level) ** 2  # far from the solution robust weights must not let go of all
+        trust = (grey, c.sigma_depth_m**2, floor, c.cauchy, gate)
         view = (images[level], *pose, self._mount, self._intrinsics)
         used = linearise(self._patches.arrays, level, view, trust, H, g, fate)
         ground = np.array([c.sigma_height_m, c.sigma_slope, c.sigma_slope])
