@@ -212,6 +212,15 @@ def test_another_place_moves_nothing(ground, plain):
     assert camera.update(picture(ground, far, seed=7), filter_, plain, PlaneConfig()).used > 40
 
 
+def test_a_sweep_that_moved_the_prior_far_does_not_lose_the_patches(ground, plain):
+    """0.4 m are 32 px: too far to find from there, but not from where the last image was."""
+    camera = begun(ground, plain)
+    filter_ = filter_at((FIRST[0], FIRST[1] + [0.4, 0.0, 0.0]), shift_m=1.0)
+    normal = camera.update(picture(ground, FIRST, seed=3), filter_, plain, PlaneConfig())
+    assert normal.used > 40
+    assert error_px(filter_.state, FIRST) < 0.1
+
+
 def test_information_is_honest_when_the_map_is_wrong(ground, plain):
     """Depths off by their sigmas, each and all together: NEES per degree of freedom of the pose by the image alone."""
     nees, c = [], CameraConfig().direct
