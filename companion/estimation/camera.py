@@ -7,7 +7,7 @@ camera holds the vehicle where a LiDAR direction is blind, but is no absolute fi
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import msgspec
@@ -16,10 +16,12 @@ from numba import njit
 
 from companion.core.messages import Array, Array32, Bytes2D
 from companion.core.rig import Rig
+from companion.estimation.direct_config import DirectConfig
 from companion.estimation.filter import Filter
+from companion.estimation.ground_rays import GroundRays
 from companion.estimation.image_gate import ImageGate, ImageGateConfig
 from companion.estimation.point_map import PointMap
-from companion.estimation.registration import Flags, Normal, PlaneConfig, find_planes
+from companion.estimation.registration import Flags, Normal, PlaneConfig
 
 cv2.setNumThreads(1)  # same bits every time, and the other cores are not ours
 
@@ -33,6 +35,8 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Tracking and the trust in it."""
 
     enabled: bool = True
+    method: Literal["tracks", "direct"] = "tracks"  # corners followed, or patches aligned by their grey levels
+    direct: DirectConfig = DirectConfig()
     image: ImageGateConfig = ImageGateConfig()
     tracks: Count = 120  # at most
     refill_below: Count = 60  # look for new corners when fewer are left
@@ -61,7 +65,7 @@ class CameraTracker:
         self._last: Bytes2D | None = None
         self._pixels = np.empty((0, 2), np.float32)  # OpenCV's: the centre of the first pixel is 0
         self._anchors = np.empty((0, 3))
-        self._ground_m = 0.0  # usual height of the anchors, a first guess of depth
+        self._ground = GroundRays(rig, depth_m=(config.min_depth_m, config.max_depth_m))
         self._gate = ImageGate(config.image)
         self.objection = ""  # to the last image
         self.renewed = 0.0  # share of the tracks that the last image began
@@ -135,34 +139,10 @@ class CameraTracker:
         if corners is None:
             return
         found = np.asarray(corners, np.float32).reshape(-1, 2)
-        anchors, good = self._anchor(found, filter_, target, planes)
+        anchors, _, good = self._ground.meet(found, filter_.state, target, planes)
         self.renewed = float(good.sum()) / max(len(self._pixels) + int(good.sum()), 1)
         self._pixels = np.concatenate([self._pixels, found[good]])
         self._anchors = np.concatenate([self._anchors, anchors[good]])
-
-    def _anchor(self, corners: Array32, filter_: Filter, target: PointMap, planes: PlaneConfig) -> tuple[Array, Flags]:
-        """Where the corners' rays meet the map: fixed point of intersecting with the local plane."""
-        R, p = filter_.state.R, filter_.state.p
-        f, cx, cy = self._intrinsics
-        optical = np.column_stack([(corners[:, 0] + 0.5 - cx) / f, (corners[:, 1] + 0.5 - cy) / f])
-        rays = np.column_stack([optical, np.ones(len(corners))]) @ (R @ self._R).T
-        origin = p + R @ self._p
-        downward = rays[:, 2] < -0.2
-        depth = np.where(downward, (origin[2] - self._ground_m) / np.maximum(-rays[:, 2], 0.2), 0.0)
-        found, valid = np.zeros((len(corners), 4)), np.zeros(len(corners), np.bool_)
-        for _ in range(4):
-            at = origin + rays * depth[:, None]
-            find_planes(target, at, np.eye(3), np.zeros(3), planes, found, valid)
-            across = (found[:, :3] * rays).sum(axis=1)
-            usable = valid & downward & (np.abs(across) > 0.15)
-            hit = -(found[:, :3] @ origin + found[:, 3]) / np.where(usable, across, 1.0)
-            usable &= (hit > self.config.min_depth_m) & (hit < self.config.max_depth_m)
-            settled = usable & (np.abs(hit - depth) < 0.05)
-            depth = np.where(usable, hit, depth)
-        anchors = origin + rays * depth[:, None]
-        if settled.sum() > 5:
-            self._ground_m = float(np.median(anchors[settled, 2]))
-        return anchors, settled
 
     def _project(self, R: Array, p: Array) -> Array32:
         """Anchors (N, 3) to OpenCV pixels (N, 2)."""

@@ -19,6 +19,7 @@ from companion.core.rig import Rig
 from companion.estimation.blind_axes import BlindAxes, BlindAxesConfig, BlindDrift
 from companion.estimation.camera import CameraConfig, CameraTracker
 from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
+from companion.estimation.direct_camera import DirectCamera
 from companion.estimation.downsample import Thinner
 from companion.estimation.features import EdgeMap, EdgesAndPlanes, EdgesConfig, Registration
 from companion.estimation.filter import Filter, Linearise
@@ -87,7 +88,8 @@ class Lio:
         self._edges = EdgeMap(config.edges, rig.lidar) if config.features == "edges_and_planes" else None
         self._densities = config.noise.densities
         self._standing = Standing(start, config.standing)
-        self._tracker = CameraTracker(camera or CameraConfig(), rig)
+        self._swept: Normal | None = None  # what the newest sweep said
+        self._tracker = self._camera_of(camera or CameraConfig(), rig)
 
     @classmethod
     def at_rest(cls, samples: Array, config: LioConfig, rig: Rig, camera: CameraConfig | None = None) -> Lio:
@@ -159,6 +161,14 @@ class Lio:
             self._track_error.extend(self.filter.state, self.filter.P, share)
         return normal
 
+    def _camera_of(self, config: CameraConfig, rig: Rig) -> CameraTracker | DirectCamera:
+        return DirectCamera(config, rig, self._hold) if config.method == "direct" else CameraTracker(config, rig)
+
+    def _hold(self) -> float:
+        """How well the newest sweep holds its blindest axis (`Normal.weakest`); 0 while sweeps are out."""
+        out = self.filter.t_s - self._scan_s > self.config.lidar_out_s
+        return 0.0 if out or self._swept is None else self._swept.weakest
+
     def _register(self, points_body: Array32, edges_body: Array) -> Normal | None:
         """What the sweep said; None: it came after a gap, does not fit the map, and corrected nothing."""
         self._take_back_drift()
@@ -173,6 +183,7 @@ class Lio:
             return None
         move_nodes(self._nodes, before, self._pose())
         self._standing.seen(normal)
+        self._swept = normal
         self._blind.seen()
         self._imu_doubt.corrected(self.filter)
         return normal
