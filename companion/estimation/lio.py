@@ -231,7 +231,7 @@ class Lio:
         if shift is None:
             self.filter.P = self.filter.P + self._track_error.covariance(self.filter.state)
             self._track_error.reset()
-        if shift is not None and self.filter.t_s - self._image_s > self.config.camera_out_s:
+        if shift is not None and self._standing.is_over and self.filter.t_s - self._image_s > self.config.camera_out_s:
             self._drift.grow(shift, dt_s)
         elif self._drift.C.any():
             self.filter.P = self.filter.P + self._drift.covariance

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from companion.core.rig import Mount, Rig
 from companion.estimation.blind_axes import BlindAxes, BlindAxesConfig, BlindDrift
+from companion.estimation.lio import Lio, LioConfig
 from companion.estimation.registration import Normal
 
 KNOWN = np.diag([1e-6] * 3 + [1e-4] * 3)  # a pose known to a milliradian and a centimetre
@@ -96,3 +98,22 @@ def test_the_drift_stays_a_covariance_though_the_blind_way_turns():
         way = Rotation.from_euler("z", 0.3 * rng.normal()).apply([1.0, 0.0, 0.0])
         drift.grow(np.outer(way, way), 0.1)
         assert np.linalg.eigvalsh(drift.C).min() > -1e-9 * np.trace(drift.C)
+
+
+def over_a_plain(lio, seconds, accel_m_s2, rng):
+    """Sweeps at 10 Hz of level ground 1 m below, which look the same wherever one is; sigma of position, m."""
+    for _ in range(10 * seconds):
+        lio.predict(np.tile([0.005, 0, 0, 0, accel_m_s2, 0, 9.81], (20, 1)))
+        angle, away = rng.uniform(0, 2 * np.pi, 3000), rng.uniform(2, 8, 3000)
+        ground = np.stack([away * np.cos(angle), away * np.sin(angle), -1 + rng.normal(0, 0.01, 3000)], axis=1)
+        lio.update_lidar(ground.astype(np.float32), np.zeros(3000, np.float32))
+    return np.sqrt(np.diag(lio.covariance)[3:6])
+
+
+def test_without_a_camera_a_plain_makes_the_position_unsure_once_the_vehicle_moves():
+    rng = np.random.default_rng(5)
+    lio = Lio.at_rest(np.tile([0, 0, 0, 0, 0, 9.81], (200, 1)), LioConfig(), Rig(lidar=Mount()))
+    assert over_a_plain(lio, 5, 0.0, rng).max() < 0.01
+    x, y, z = over_a_plain(lio, 5, 0.5, rng)
+    assert x > 0.4 and y > 0.4  # 0.04 m/s2 for 5 s, at least
+    assert z < 0.02
