@@ -33,6 +33,8 @@ class LandingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """So far aside it goes at least when the range finder sees what the map does not hold, up to ..."""
     moves: Annotated[int, msgspec.Meta(ge=0)] = 3
     """... so many times."""
+    clear_s: NotNegative = 5.0
+    """Nothing that moves may come over the place in this time, or the landing waits."""
     uneven_m: NotNegative = 0.6
     """Largest difference of the ground's heights under the column."""
 

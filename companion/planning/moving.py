@@ -35,7 +35,7 @@ def with_moving(local_map: LocalMap, tracks: ObstacleTracks | None, now_ns: int,
 
     Distances are exact up to a cell's half, truncated as the map's. Without fresh tracks it is `local_map` itself.
     """
-    if tracks is None or not len(tracks.id) or abs(now_ns - tracks.stamp_ns) > config.fresh_s * 1e9:
+    if tracks is None or not len(tracks.id) or not _fresh(tracks, now_ns, config):
         return local_map
     late_s = (now_ns - tracks.stamp_ns) * 1e-9
     distance, unknown = local_map.distance_m.copy(), local_map.unknown_distance_m.copy()
@@ -50,6 +50,32 @@ def with_moving(local_map: LocalMap, tracks: ObstacleTracks | None, now_ns: int,
     moved = replace(local_map, distance_m=distance, unknown_distance_m=unknown)
     freeze(moved)
     return moved
+
+
+def is_crossed(
+    places_odom: Array,
+    tracks: ObstacleTracks | None,
+    now_ns: int,
+    config: MovingConfig,
+    *,
+    within_s: float,
+    hull_m: float,
+) -> bool:
+    """Does something that moves come over one of the places (N, 3), as wide as the hull, in the time to come?
+
+    In plan: whoever comes down passes all heights.
+    """
+    if tracks is None or not _fresh(tracks, now_ns, config):
+        return False
+    for p, v, radius_m in zip(tracks.position_odom, tracks.velocity_odom, tracks.radius_m, strict=True):
+        away = _from_segment(places_odom[:, 0], places_odom[:, 1], np.stack([p, p + within_s * v]))
+        if away.min() < hull_m + float(radius_m) + config.margin_m:
+            return True
+    return False
+
+
+def _fresh(tracks: ObstacleTracks, now_ns: int, config: MovingConfig) -> bool:
+    return abs(now_ns - tracks.stamp_ns) <= config.fresh_s * 1e9
 
 
 def _lower(field: Array32, local_map: LocalMap, swept: Array, size_m: Array, most_m: float) -> None:
@@ -69,7 +95,7 @@ def _lower(field: Array32, local_map: LocalMap, swept: Array, size_m: Array, mos
 
 
 def _from_segment(x: Array, y: Array, ends: Array) -> Array:
-    """Distance in plan of places x (X, 1), y (1, Y) to the segment between two ends (2, 3), (X, Y)."""
+    """Distance in plan of places x, y, whose shapes go together, to the segment between two ends (2, 3)."""
     way = ends[1, :2] - ends[0, :2]
     dx, dy = x - ends[0, 0], y - ends[0, 1]
     t = np.clip((dx * way[0] + dy * way[1]) / max(float(way @ way), 1e-9), 0.0, 1.0)

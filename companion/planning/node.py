@@ -23,9 +23,9 @@ from companion.core.node import Node, Outputs, every, on
 from companion.planning.config import PlanningConfig
 from companion.planning.flown import Flown
 from companion.planning.landing import Columns, beam_fault, stopping_place
-from companion.planning.moving import with_moving
+from companion.planning.moving import is_crossed, with_moving
 from companion.planning.polyline import at, cut, length, project
-from companion.planning.replanner import Replanner
+from companion.planning.replanner import Replanner, State
 from companion.planning.situation import Situation
 from companion.planning.space import fill_ground, serves
 from companion.planning.target import ground_below
@@ -47,6 +47,7 @@ class PlanningNode(Node):
         self._range: RangeReading | None = None
         self._landing: Goal | None = None  # the goal of kind land that is flown
         self._moves = 0  # places given up for it
+        self._waits = False  # it is put off: something that moves would come by
         self._no_place = ""  # why the vehicle should not land where it is; '' if nothing is against it
         self._replanner = Replanner(config, hull_radius_m=hull_radius_m, seed=seed)
         self._odometry: Odometry | None = None
@@ -64,7 +65,7 @@ class PlanningNode(Node):
     @on(topics.GOAL)
     def take_goal(self, message: Goal) -> Outputs:
         """A new goal is planned for at once."""
-        self._no_place, self._landing, self._moves = "", None, 0
+        self._no_place, self._landing, self._moves, self._waits = "", None, 0, False
         if message.kind == "land":
             self._landing, message = message, self._above_a_place(message)
         self._replanner.take_goal(message)
@@ -110,10 +111,31 @@ class PlanningNode(Node):
         landing, odometry, local_map = self._landing, self._odometry, self._map
         if landing is None or odometry is None or local_map is None or not self._replanner.reached:
             return
-        if self._no_place or self._moves >= self.config.landing.moves or not self._seen_below(odometry, local_map):
+        if (
+            self._waits
+            or self._no_place
+            or self._moves >= self.config.landing.moves
+            or not self._seen_below(odometry, local_map)
+        ):
             return
         self._moves += 1
         self._replanner.take_goal(self._above_a_place(landing, beyond_m=self.config.landing.aside_m))
+
+    def _wait_for_what_moves(self) -> None:
+        """While it would come over the place to land, or where the vehicle is, it holds and keeps out of its way."""
+        landing, goal, odometry = self._landing, self._replanner.goal, self._odometry
+        if landing is None or goal is None or odometry is None or self._map is None:
+            return
+        places = np.stack([odometry.p_odom, goal.p_odom])
+        reach_m, clear_s = self._hull_radius_m + self.config.landing.pad_m, self.config.landing.clear_s
+        moving = self.config.moving
+        waits = is_crossed(places, self._tracks, odometry.stamp_ns, moving, within_s=clear_s, hull_m=reach_m)
+        if waits != self._waits:
+            self._waits, self._no_place = waits, ""
+            hold = replace(landing, kind="hold", p_odom=goal.p_odom)
+            self._replanner.take_goal(hold if waits else self._above_a_place(landing))
+            what = "wait before landing" if waits else "land after all"
+            self._replanner.whys.append((what, f"what moves {'comes' if waits else 'does not come'} by"))
 
     @on(topics.LOCAL_MAP)
     def take_map(self, message: LocalMap) -> Outputs:
@@ -131,10 +153,12 @@ class PlanningNode(Node):
         """Is the goal reached? Says so between replans."""
         if self._odometry is not None:
             self._replanner.look(self._odometry.p_odom, self._odometry.v_odom)
+        self._wait_for_what_moves()
         self._move_aside()
         yield topics.PLAN(self._status(now_ns))
 
     def _replan(self) -> Outputs:
+        self._wait_for_what_moves()
         goal, odometry, local_map = self._replanner.goal, self._odometry, self._map
         if goal is None or odometry is None or local_map is None:
             return
@@ -168,6 +192,13 @@ class PlanningNode(Node):
             yaw_rate_limit=goal.limits.yaw_rate,
         )
 
+    @property
+    def _state(self) -> State:
+        """On its way while it waits to land: neither there nor without a way."""
+        if self._waits:
+            return "flying"
+        return "blocked" if self._no_place else self._replanner.state
+
     def _status(self, now_ns: int) -> PlanStatus:
         replanner, odometry = self._replanner, self._odometry
         goal, flown = replanner.goal, replanner.flown
@@ -179,12 +210,12 @@ class PlanningNode(Node):
         return PlanStatus(
             stamp_ns=now_ns,
             goal_id=goal.id if goal is not None else -1,
-            state="blocked" if self._no_place else replanner.state,
+            state=self._state,
             distance_m=distance_m,
             plan_p_odom=ahead,
             cost_m=flown.reach_m if flown is not None else math.nan,
             iterations=replanner.iterations,
-            reason=self._no_place or (replanner.reason if replanner.state == "blocked" else ""),
+            reason=self._no_place or (replanner.reason if self._state == "blocked" else ""),
             checked=replanner.checked,
             refused=replanner.refused,
         )

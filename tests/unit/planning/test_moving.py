@@ -5,7 +5,7 @@ import pytest
 
 from companion.core.messages import Limits, ObstacleTracks
 from companion.planning.flown import with_speeds
-from companion.planning.moving import MovingConfig, with_moving
+from companion.planning.moving import MovingConfig, is_crossed, with_moving
 from companion.planning.space import FieldSpace
 from companion.planning.speed_profile import SpeedConfig
 
@@ -108,3 +108,17 @@ def test_one_gets_out_of_the_way_of_what_comes_as_fast_as_what_stands_allows(loc
     assert speed_at(0.8, still) > 1.5
     towards = aside[::-1].copy()  # what begins outside is as slow on its way in as before
     assert speed_at(2.7, still, towards) == speed_at(2.7, None, towards)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_place_is_crossed_if_the_cylinder_comes_over_it_in_time(seed):
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-5, 5, (6, 3))
+    seen = tracks(rng.uniform(-5, 5, (2, 3)), rng.uniform(-1.5, 1.5, (2, 3)))
+    way = seen.position_odom[:, None] + np.linspace(0.0, 4.0, 4001)[:, None] * seen.velocity_odom[:, None]
+    away = np.linalg.norm(way[:, :, None, :2] - places[:, :2], axis=-1).min(axis=(0, 1))
+    for place, gap_m in zip(places, away, strict=True):
+        for hull_m, crossed in ((gap_m - 0.51, False), (gap_m - 0.49, True)):  # 0.3 m of radius and 0.2 of margin
+            assert is_crossed(place[None], seen, 0, CONFIG, within_s=4.0, hull_m=hull_m) is crossed
+    assert not is_crossed(places, seen, 2 * SECOND, CONFIG, within_s=4.0, hull_m=9.0)  # too old
+    assert not is_crossed(places, None, 0, CONFIG, within_s=4.0, hull_m=9.0)

@@ -49,6 +49,25 @@ def hold_among(flights, local_map, start, velocity, seconds):
     return flight, np.array(gaps)
 
 
+@pytest.mark.parametrize("speed", [0.8, 1.2])
+def test_a_landing_waits_until_the_walker_has_passed(flights, local_map, speed):
+    flight = flights.Flight(local_map, hall(), HELD, known=np.ones_like(hall()), gust=0.0)
+    flight.run(0.3)
+    flight.send(flights.goal_at(HELD, goal_id=2, kind="land", blocked="nearest_free", radius_m=0.5))
+    gaps, states = [], []
+    for k in range(round(80 / speed)):
+        walker, v = np.array([HELD[0] - 4.0 + 0.1 * k * speed, 6.1, 1.4]), [speed, 0.0, 0.0]
+        if k % 2 == 0:
+            list(flight.planning.handle(topics.OBSTACLE_TRACKS, tracks(walker, v, flight.now_ns)))
+        flight.run(0.1)
+        states.append((walker[0] < HELD[0] + 0.5, flight.status.state))
+        gaps.append(np.linalg.norm((flight.vehicle.p - walker)[:2]) - WALKER_M - flights.HULL_M)
+    assert {state for comes, state in states[2:] if comes} == {"flying"}
+    assert min(gaps) > 0.3
+    assert states[-1] == (False, "reached")
+    assert np.linalg.norm(flight.vehicle.p[:2] - HELD[:2]) < 2.0
+
+
 @pytest.mark.parametrize("speed", [0.5, 1.0, 1.6])
 def test_it_steps_aside_and_comes_back(flights, local_map, speed):
     flight, gaps = hold_among(flights, local_map, [HELD[0] - 4.0, 6.1, 1.4], [speed, 0.0, 0.0], 8.0 / speed)
