@@ -20,8 +20,9 @@ from companion.estimation.direct_config import DirectConfig
 from companion.estimation.filter import Filter
 from companion.estimation.ground_rays import GroundRays
 from companion.estimation.image_gate import ImageGate, ImageGateConfig
+from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap
-from companion.estimation.registration import Flags, Normal, PlaneConfig
+from companion.estimation.registration import Flags, PlaneConfig
 
 cv2.setNumThreads(1)  # same bits every time, and the other cores are not ours
 

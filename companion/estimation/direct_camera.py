@@ -20,10 +20,11 @@ from companion.estimation.camera import CameraConfig
 from companion.estimation.filter import Filter
 from companion.estimation.ground_rays import GroundRays
 from companion.estimation.image_gate import ImageGate
+from companion.estimation.normal import Normal
 from companion.estimation.patches import cut, no_patches, pyramid
 from companion.estimation.photometric import FOUND, MISSED, SHARED, linearise
 from companion.estimation.point_map import PointMap
-from companion.estimation.registration import Normal, PlaneConfig
+from companion.estimation.registration import PlaneConfig
 
 
 class DirectCamera:

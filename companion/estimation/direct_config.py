@@ -35,8 +35,6 @@ class DirectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     first_gate: Positive = 400.0  # chi2 of the first iteration
     gate: Positive = 100.0  # of the others
     inflation: Positive = 4.0  # patches are not independent: information is divided by it
-    yield_above: Positive = (
-        0.01  # smallest eigenvalue of a sweep's scaled information at which it is divided by two more
-    )
+    yield_above: Positive = 0.01  # smallest eigenvalue of a sweep (scaled) at which it is divided by two more
     iterations: Count = 4  # at the finest level; one at each of the others
     keep_images: Count = 15  # bad images that the patches outlive

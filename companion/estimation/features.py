@@ -18,8 +18,9 @@ from companion.core.rig import Mount
 from companion.estimation.downsample import Thinner
 from companion.estimation.edges import EdgeConfig, find_edges
 from companion.estimation.lines import LineConfig, LineRegistration
+from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap, PointMapConfig
-from companion.estimation.registration import Normal, PlaneRegistration
+from companion.estimation.registration import PlaneRegistration
 
 
 class EdgesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -9,8 +9,8 @@ import numpy as np
 
 from companion.core.geometry import log_so3
 from companion.core.messages import Array
+from companion.estimation.normal import Normal
 from companion.estimation.propagation import propagate
-from companion.estimation.registration import Normal
 from companion.estimation.state import ERROR, State
 
 Linearise = Callable[[Array, Array], Normal]

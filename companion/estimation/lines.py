@@ -14,8 +14,9 @@ import numpy as np
 from numba import njit
 
 from companion.core.messages import Array
+from companion.estimation.nearest_registration import NearestRegistration
 from companion.estimation.point_map import PointMap
-from companion.estimation.registration import Flags, Normal, nearest_five
+from companion.estimation.registration import Flags, nearest_five
 from companion.estimation.so3 import multiply_into
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -34,45 +35,28 @@ class LineConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     search_again_m: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # motion that makes neighbours stale
 
 
-class LineRegistration:
-    """Linearises the edges of one scan at one pose after another, searching neighbours only when needed."""
+class LineRegistration(NearestRegistration):
+    """Edge points against lines of a map of edges."""
 
     def __init__(self, target: PointMap, points_body: Array, config: LineConfig) -> None:
-        self.points = points_body
+        super().__init__(points_body, numbers=6, inflation=config.inflation, search_again_m=config.search_again_m)
         self._map, self._config = target, config
-        self._lines = np.zeros((len(points_body), 6))
-        self._valid = np.zeros(len(points_body), np.bool_)
-        self._searched: tuple[Array, Array] | None = None
 
-    def linearise(self, R: Array, p: Array) -> Normal:
-        """Normal equations at the pose (R_odom_body, p_odom)."""
-        if self._is_stale(R, p):
-            self._search(R, p)
-        H, g = np.empty((6, 6)), np.empty(6)
+    def find(self, R: Array, p: Array) -> None:
+        """Lines at the pose."""
+        find_lines(self._map, self.points, R, p, self._config, self.met, self.valid)
+
+    def add(self, R: Array, p: Array, H: Array, g: Array) -> int:
+        """Of points against their lines."""
         c = self._config
         limits = (1.0 / c.sigma_m**2, c.cauchy, c.gate_m)
-        used = _linearise(self.points, R, p, self._lines, self._valid, limits, H, g)
-        return Normal(R.copy(), p.copy(), H / c.inflation, g / c.inflation, used, len(self.points))
+        return int(_linearise(self.points, R, p, self.met, self.valid, limits, H, g))
 
-    def fits(self, R: Array, p: Array, distance_m: float) -> tuple[int, int, int]:
-        """How many points lie within a distance of their line, how many have one, and how many there are.
-
-        Lines are searched anew at the pose.
-        """
-        self._search(R, p)
-        off = self.points @ R.T + p - self._lines[:, :3]
-        across2 = (off**2).sum(axis=1) - (off * self._lines[:, 3:]).sum(axis=1) ** 2
-        return int((self._valid & (across2 < distance_m**2)).sum()), int(self._valid.sum()), len(self.points)
-
-    def _search(self, R: Array, p: Array) -> None:
-        find_lines(self._map, self.points, R, p, self._config, self._lines, self._valid)
-        self._searched = (R.copy(), p.copy())
-
-    def _is_stale(self, R: Array, p: Array) -> bool:
-        if self._searched is None:
-            return True
-        moved = np.linalg.norm(p - self._searched[1]) + 3.0 * np.linalg.norm(R - self._searched[0])
-        return bool(moved > self._config.search_again_m)
+    def off_m(self, R: Array, p: Array) -> Array:
+        """Across the lines."""
+        off = self.points @ R.T + p - self.met[:, :3]
+        along = (off * self.met[:, 3:]).sum(axis=1)
+        return np.asarray(np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0.0)))
 
 
 def find_lines(

@@ -26,9 +26,10 @@ from companion.estimation.filter import Filter, Linearise
 from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
 from companion.estimation.lines import LineConfig, LineRegistration
 from companion.estimation.map_error import MapError, MapErrorConfig
+from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagation import NODE, ImuNoise
-from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
+from companion.estimation.registration import PlaneConfig, PlaneRegistration
 from companion.estimation.search import SearchConfig, few_of, search
 from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter

@@ -21,8 +21,8 @@ from companion.core.topics import CAMERA, IMU, LIDAR, LIKELIHOOD, LIO_STATE, REG
 from companion.estimation.config import EstimationConfig
 from companion.estimation.imu_doubt import new_buffer
 from companion.estimation.lio import Lio, ScanResult
+from companion.estimation.normal import Normal
 from companion.estimation.ordering import Reorder
-from companion.estimation.registration import Normal
 from companion.estimation.start import is_at_rest
 
 _START_CHECK_NS = 100_000_000

@@ -6,7 +6,6 @@ residual test); weights after Cauchy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from typing import Annotated
 
@@ -16,12 +15,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.core.messages import Array
+from companion.estimation.nearest_registration import NearestRegistration
 from companion.estimation.point_map import PointMap
 from companion.estimation.voxels import pack, slot_of
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Flags = NDArray[np.bool_]
-LEVER = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # 1/m: rotation counts by its effect 10 m away
 
 
 class PlaneConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -37,80 +36,27 @@ class PlaneConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     search_again_m: Annotated[float, msgspec.Meta(ge=0)] = 0.03  # motion that makes neighbours stale
 
 
-@dataclass(frozen=True, slots=True)
-class Normal:
-    """0.5 dx' H dx - g' dx at a pose, dx = (theta_body, p_odom)."""
-
-    R: Array  # (3, 3), where it was linearised
-    p: Array  # (3,)
-    H: Array  # (6, 6)
-    g: Array  # (6,)
-    used: int
-    offered: int
-
-    @property
-    def weakest(self) -> float:
-        """Smallest eigenvalue of the scaled information, 0..1/3: near 0, a direction is blind."""
-        return float(np.linalg.eigvalsh(LEVER @ self.H @ LEVER / self.scale)[0]) if self.scale > 0 else 0.0
-
-    @property
-    def scale(self) -> float:
-        """Sum of the information on position, 1/m2: eigenvalues are compared with it."""
-        return float(np.trace(self.H[3:, 3:]))
-
-    def weak_axes(self, below: float) -> list[str]:
-        """Names of the directions in which it says hardly anything, in odom: an axis, or a turn about one."""
-        if self.scale <= 0:
-            return ["every axis"]
-        values, vectors = np.linalg.eigh(LEVER @ self.H @ LEVER / self.scale)
-        return [_named(v, self.R) for v in vectors[:, values < below].T]
-
-
-def _named(direction: Array, R: Array) -> str:
-    """Of a unit vector (6,) in lever coordinates: what of it is larger, shift or turn."""
-    turn, shift = R @ direction[:3], direction[3:]
-    is_shift = np.linalg.norm(shift) >= np.linalg.norm(turn)
-    axis = shift if is_shift else turn
-    x, y, z = axis / np.linalg.norm(axis) * (np.sign(axis[np.argmax(np.abs(axis))]) or 1.0)
-    return f"{'position along' if is_shift else 'turn about'} ({x:.1f} {y:.1f} {z:.1f})"
-
-
-class PlaneRegistration:
-    """Linearises one scan at one pose after another, searching neighbours only when needed."""
+class PlaneRegistration(NearestRegistration):
+    """Points against planes of the map."""
 
     def __init__(self, target: PointMap, points_body: Array, config: PlaneConfig) -> None:
-        self.points = points_body
+        super().__init__(points_body, numbers=4, inflation=config.inflation, search_again_m=config.search_again_m)
         self._map, self._config = target, config
-        self._planes = np.zeros((len(points_body), 4))  # rows without a plane are multiplied, too
-        self._valid = np.zeros(len(points_body), np.bool_)
-        self._searched: tuple[Array, Array] | None = None
 
-    def linearise(self, R: Array, p: Array) -> Normal:
-        """Normal equations at the pose (R_odom_body, p_odom)."""
-        if self._is_stale(R, p):
-            self._searched = (R.copy(), p.copy())
-            find_planes(self._map, self.points, R, p, self._config, self._planes, self._valid)
-        H, g = np.empty((6, 6)), np.empty(6)
+    def find(self, R: Array, p: Array) -> None:
+        """Planes at the pose."""
+        find_planes(self._map, self.points, R, p, self._config, self.met, self.valid)
+
+    def add(self, R: Array, p: Array, H: Array, g: Array) -> int:
+        """Of points against their planes."""
         c = self._config
         limits = (1.0 / c.sigma_m**2, c.cauchy, c.range_gate)
-        used = _linearise(self.points, R, p, self._planes, self._valid, limits, H, g)
-        return Normal(R.copy(), p.copy(), H / c.inflation, g / c.inflation, used, len(self.points))
+        return int(_linearise(self.points, R, p, self.met, self.valid, limits, H, g))
 
-    def fits(self, R: Array, p: Array, distance_m: float) -> tuple[int, int, int]:
-        """How many points lie within a distance of their plane, how many have one, and how many there are.
-
-        Planes are searched anew at the pose.
-        """
-        find_planes(self._map, self.points, R, p, self._config, self._planes, self._valid)
-        self._searched = (R.copy(), p.copy())
-        off = np.abs((self._planes[:, :3] * (self.points @ R.T + p)).sum(axis=1) + self._planes[:, 3])
-        return int((self._valid & (off < distance_m)).sum()), int(self._valid.sum()), len(self.points)
-
-    def _is_stale(self, R: Array, p: Array) -> bool:
-        if self._searched is None:
-            return True
-        moved = np.linalg.norm(p - self._searched[1]) + 3.0 * np.linalg.norm(R - self._searched[0])
-        return bool(moved > self._config.search_again_m)
+    def off_m(self, R: Array, p: Array) -> Array:
+        """From the planes."""
+        off: Array = np.abs((self.met[:, :3] * (self.points @ R.T + p)).sum(axis=1) + self.met[:, 3])
+        return off
 
 
 def find_planes(

@@ -14,7 +14,7 @@ import numpy as np
 from companion.core.geometry import log_so3
 from companion.core.messages import Array
 from companion.estimation.filter import Filter
-from companion.estimation.registration import Normal
+from companion.estimation.normal import Normal
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 _WINDOW = 40  # IMU samples over which means are taken, 0.2 s

@@ -19,8 +19,8 @@ from companion.estimation.filters.sigma_points import (
     propagate_points,
     spread,
 )
+from companion.estimation.normal import Normal
 from companion.estimation.propagation import propagate
-from companion.estimation.registration import Normal
 from companion.estimation.state import ERROR, State
 
 _WEAKEST = 1e-6  # eigenvalues of a registration below this say nothing

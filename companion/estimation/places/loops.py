@@ -54,10 +54,8 @@ class LoopConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     odometry_sigma_rad: Positive = 2e-3
     closure_sigma_m: Positive = 0.03
     closure_sigma_rad: Positive = 4e-3
-    doubt_sigmas: Positive = (
-        5.0  # a closure that is so far from the chain, by what odometry says of itself, is wrong ...
-    )
-    doubt_from_m: Annotated[float, msgspec.Meta(ge=0)] = 0.15  # ... and farther than this
+    doubt_sigmas: Positive = 5.0  # farther from the chain, by what odometry says of itself, no closure can be ...
+    doubt_from_m: Annotated[float, msgspec.Meta(ge=0)] = 0.15  # ... beyond this
 
 
 Drift = tuple[float, float]  # variance of position (m2) and of yaw (rad2) in odom; they grow

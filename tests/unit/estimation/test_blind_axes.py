@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from companion.core.rig import Mount, Rig
 from companion.estimation.blind_axes import BlindAxes, BlindAxesConfig, BlindDrift
 from companion.estimation.lio import Lio, LioConfig
-from companion.estimation.registration import Normal
+from companion.estimation.normal import Normal
 
 KNOWN = np.diag([1e-6] * 3 + [1e-4] * 3)  # a pose known to a milliradian and a centimetre
 

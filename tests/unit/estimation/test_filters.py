@@ -13,8 +13,8 @@ from companion.estimation.filters.kalman import KalmanFilter, constant_velocity
 from companion.estimation.filters.measurements import GroundFlow, PositionFix, RangeBelow, VelocityFix
 from companion.estimation.filters.sigma_points import errors_about, move_to_mean, propagate_points, spread
 from companion.estimation.filters.unscented import UnscentedFilter, whitened
+from companion.estimation.normal import Normal
 from companion.estimation.propagation import ImuNoise, propagate
-from companion.estimation.registration import Normal
 from companion.estimation.state import State
 
 DENSITIES = ImuNoise().densities

@@ -9,8 +9,9 @@ from companion.estimation.health import HealthConfig, judge
 from companion.estimation.image_gate import ImageGate, ImageGateConfig
 from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
 from companion.estimation.map_error import MapError
+from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap, PointMapConfig
-from companion.estimation.registration import Normal, PlaneConfig, PlaneRegistration
+from companion.estimation.registration import PlaneConfig, PlaneRegistration
 from companion.estimation.search import SearchConfig, few_of, search
 from companion.estimation.start import StartConfig, start_filter
 from companion.estimation.state import State

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.core.geometry import exp_so3, log_so3
 from companion.core.rig import Rig
-from companion.estimation import camera, registration
+from companion.estimation import camera
 from companion.estimation.deskew import (
     ScanGate,
     constant_twist_nodes,
@@ -17,6 +17,7 @@ from companion.estimation.deskew import (
     move_nodes,
 )
 from companion.estimation.downsample import Thinner
+from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagation import ImuNoise, propagate
 from companion.estimation.registration import PlaneConfig, PlaneRegistration, find_planes
@@ -298,7 +299,7 @@ def test_plane_jacobian_is_the_finite_difference():
     points = (target.points()[::40].astype(np.float64) + rng.normal(0, 0.02, (1, 3)) - p) @ R
     scan = PlaneRegistration(target, points, PlaneConfig(cauchy=1e12, range_gate=1e3, inflation=1.0))
     normal = scan.linearise(R, p)
-    planes, valid = scan._planes.copy(), scan._valid.copy()
+    planes, valid = scan.met.copy(), scan.valid.copy()
     assert valid.sum() > 200
 
     def cost(dx):
@@ -341,7 +342,7 @@ def test_camera_jacobian_is_the_finite_difference():
         r = pixels - project(R @ exp_so3(dx[:3]), p + dx[3:])
         return 0.5 * (r**2).sum() / 3.2**2
 
-    normal = registration.Normal(R, p, H, g, 80, 80)
+    normal = Normal(R, p, H, g, 80, 80)
     check_normal_equations(cost, normal)
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from companion.estimation.normal import Normal
 from companion.estimation.propagation import ImuNoise
-from companion.estimation.registration import Normal
 from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
 
