@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from companion.mapping.block_hash import EMPTY, enter, find, find_scratch, leave, make_scratch, slot_of
 from companion.mapping.fold import fold_bits
-from companion.mapping.marks import MarkTable
+from companion.mapping.marks import MISSES_COUNT_EVERY, MarkTable
 from companion.mapping.rays import BLOCK, CELLS, WORDS, RayGrid, ScanBits
 from companion.mapping.sensor_model import UNKNOWN, Steps
 
@@ -35,6 +35,7 @@ class BlockStore:
     def __init__(self, *, marking: bool = False) -> None:
         self.marking = marking
         self.count = self.version = 0
+        self._folded = 0  # scans
         self.xyz = np.zeros((_GROWTH, 3), np.int32)
         self.log_odds = np.zeros((_GROWTH, CELLS), np.int8)
         self.changed_at = np.zeros(_GROWTH, np.int64)  # version in which a cell last changed its class
@@ -73,7 +74,8 @@ class BlockStore:
         """
         met = grid.met()
         rows = self._make(met, grid)
-        amounts = np.array([steps.hit, steps.miss, steps.lowest, steps.highest], np.int16)
+        spares = self._folded % MISSES_COUNT_EVERY != 0
+        amounts = np.array([steps.hit, steps.miss, steps.lowest, steps.highest, spares], np.int16)
         changed = np.zeros(len(met), np.uint8)
         if watch is not None:
             watch(met, rows, grid.bits)
@@ -81,6 +83,7 @@ class BlockStore:
             self._marks.reserve(grid.hit_blocks)
         fold_bits(met, rows, grid.bits, ((self.log_odds, self._settled), self.marks), amounts, changed)
         grid.cleared()
+        self._folded += 1
         self.seen_ns[rows] = stamp_ns
         return len(met), self.xyz[self.mark_changed(rows[changed != 0])]
 

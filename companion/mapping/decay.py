@@ -14,6 +14,9 @@ decays: a branch loses a cell or two at a time, what walks leaves many.
 Where a track of something that moves has just been (`companion.mapping.walked`) no crowd is needed,
 and nothing becomes proven: a slow walker is hit twice in the same cell.
 
+Of what is proven, rays that pass through count in every fourth scan only (`MISSES_COUNT_EVERY`): a twig
+that a few scans in a hundred hit stays, and what was proven and leaves anyway stays for up to 12 s.
+
 A cell that was forgotten and is hit again comes from unknown, so it is no newcomer: evidence of
 something that stays is lost once at most. In a loaded map only newcomers go, and back to free.
 """

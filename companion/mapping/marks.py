@@ -12,6 +12,7 @@ u64 = np.uint64
 KINDS = CAME, FRESH, MISSED, QUIET, STILL, PROVEN = 0, 1, 2, 3, 4, 5
 """Bits per cell, for decay: it was at the lower clamp when it was hit; since the last pass hit, and passed
 by rays while quiet; occupied without a hit between the last two passes, and the two before; proven to stay."""
+MISSES_COUNT_EVERY = 4  # scans, for proven cells: most scans see through a thin branch that is still there
 PASSES = 4  # after which a block that no scan stirs holds nothing stale any more
 _GROWTH = 1024  # 0.4 MB
 
