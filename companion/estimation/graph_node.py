@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
-from companion.core.messages import ImuSample, LioState, PoseLikelihood, SmoothedState, Why
+from companion.core.messages import Array, ImuSample, LioState, MapFromOdom, PoseLikelihood, SmoothedState, Why
 from companion.core.node import Node, Output, on
 from companion.core.rig import Rig
-from companion.core.topics import IMU, LIKELIHOOD, LIO_STATE, SMOOTHED, WHY
+from companion.core.topics import IMU, LIKELIHOOD, LIO_STATE, MAP_FROM_ODOM, SMOOTHED, WHY
 from companion.estimation.config import EstimationConfig
 from companion.estimation.graph import Smoothed, Smoother, StartNode
 from companion.estimation.imu_doubt import new_buffer
@@ -22,7 +22,8 @@ class GraphNode(Node):
     """One graph node per likelihood; publishes after those of scans.
 
     `map` is the graph's frame levelled by its estimate of gravity, so `map` <- `odom` begins
-    as the identity and grows to the small tilt that the accelerometer bias hid at the start.
+    as the identity and grows to the small tilt that the accelerometer bias hid at the start. What
+    loops say of the way since then comes on top, so that home is where the vehicle has started from.
     """
 
     publishes = (SMOOTHED, WHY)
@@ -32,6 +33,7 @@ class GraphNode(Node):
         self._imu = new_buffer(config.lio.imu_doubt)
         self._smoother: Smoother | None = None
         self._state: LioState | None = None
+        self._loops = np.eye(3), np.zeros(3)  # R, p: by closures, from odom of now to that of the start
         self._zero_ns = self._time_ns = 0
 
     @on(IMU)
@@ -45,6 +47,11 @@ class GraphNode(Node):
         self._state = state
         if state.source == "start":
             self._begin(state)
+
+    @on(MAP_FROM_ODOM)
+    def loops(self, found: MapFromOdom) -> None:
+        """Take what closures say of the drift; the identity after a start."""
+        self._loops = rotation_from_quaternion(found.q_map_odom), found.p_map_odom
 
     @on(LIKELIHOOD)
     def likelihood(self, likelihood: PoseLikelihood) -> Iterator[Output]:
@@ -64,7 +71,7 @@ class GraphNode(Node):
             return
         self._time_ns = stamp_ns
         if smoothed and self._state and self._state.stamp_ns == likelihood.stamp_ns:
-            yield SMOOTHED(_message(smoothed, self._state))
+            yield SMOOTHED(_message(smoothed, self._state, self._loops))
 
     def _begin(self, state: LioState) -> None:
         start = StartNode(
@@ -87,19 +94,19 @@ class GraphNode(Node):
         yield WHY(Why(stamp_ns=stamp_ns, node="GraphNode", what="begin a new graph", because=because))
 
 
-def _message(smoothed: Smoothed, state: LioState) -> SmoothedState:
-    level = smoothed.R_map_gauge
-    R = level @ smoothed.pose.rotation().matrix()
-    p = level @ np.asarray(smoothed.pose.translation())
-    R_map_odom = R @ rotation_from_quaternion(state.q_odom_body).T
+def _message(smoothed: Smoothed, state: LioState, loops: tuple[Array, Array]) -> SmoothedState:
+    level, R_odom_body = smoothed.R_map_gauge, rotation_from_quaternion(state.q_odom_body)
+    R_graph = level @ smoothed.pose.rotation().matrix() @ R_odom_body.T
+    p_graph = level @ np.asarray(smoothed.pose.translation()) - R_graph @ state.p_odom
+    R_map_odom, p_map_odom = R_graph @ loops[0], R_graph @ loops[1] + p_graph
     return SmoothedState(
         stamp_ns=state.stamp_ns,
-        p_map=p,
-        q_map_body=quaternion_from_rotation(R),
-        v_map=level @ smoothed.v,
+        p_map=R_map_odom @ state.p_odom + p_map_odom,
+        q_map_body=quaternion_from_rotation(R_map_odom @ R_odom_body),
+        v_map=R_map_odom @ R_graph.T @ level @ smoothed.v,
         gyro_bias_body=smoothed.gyro_bias,
         accel_bias_body=smoothed.accel_bias,
-        p_map_odom=p - R_map_odom @ state.p_odom,
+        p_map_odom=p_map_odom,
         q_map_odom=quaternion_from_rotation(R_map_odom),
         pose_variance=smoothed.pose_variance,
         factors=smoothed.factors,

@@ -76,7 +76,7 @@ def _blocks_met(xyz: NDArray[np.int32], R: Array, t: Array) -> NDArray[np.int32]
     corner = low.min(axis=0)
     there = np.zeros(high.max(axis=0) - corner + 1, np.uint8)
     _mark(low - corner, high - corner, there)
-    met: NDArray[np.int32] = (np.argwhere(there) + corner).astype(np.int32)
+    met: NDArray[np.int32] = (np.argwhere(there) + corner).astype(np.int32, order="C")  # argwhere's is Fortran's
     return met
 
 

@@ -50,7 +50,7 @@ def align(known: Array32, seen: Array32, guess: tuple[Array, Array], config: Ver
     target.insert(known, np.eye(3), np.zeros(3))
     points = Thinner().centroids(seen, config.thin_m, at_most=config.points)
     registration = PlaneRegistration(target, points, config.plane)
-    R, p = guess
+    R, p = np.ascontiguousarray(guess[0]), guess[1]  # one layout: a kernel is compiled for each
     step = np.full(6, np.inf)
     for _ in range(config.iterations):
         normal = registration.linearise(R, p)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.core import topics
 from companion.core.geometry import log_so3, rotation_from_quaternion, skew
-from companion.core.messages import CameraImage, ImuSample, LidarScan, freeze
+from companion.core.messages import CameraImage, ImuSample, LidarScan, MapFromOdom, freeze
 from companion.core.rig import Rig
 from companion.estimation.config import EstimationConfig
 from companion.estimation.node import GraphNode, LioNode, PropagatorNode
@@ -18,7 +18,12 @@ from companion.estimation.so3 import tilt_free
 from companion.estimation.start import StartConfig, is_at_rest, start_filter
 from tests.unit.estimation.synthetic import ACCEL_BIAS, GYRO_BIAS, REST_S, G, record, trunks
 
-TOPIC = {ImuSample: topics.IMU, LidarScan: topics.LIDAR, CameraImage: topics.CAMERA}
+TOPIC = {
+    ImuSample: topics.IMU,
+    LidarScan: topics.LIDAR,
+    CameraImage: topics.CAMERA,
+    MapFromOdom: topics.MAP_FROM_ODOM,
+}
 
 
 def run(events, *, config=None, nodes=None):
@@ -178,6 +183,25 @@ def test_graph_agrees_with_the_filter_and_finds_the_bias(forest):
     in_odom = states[last.stamp_ns].p_odom - (end - start)
     in_map = last.p_map - (end - start)
     assert np.linalg.norm(in_map) < 0.6 * np.linalg.norm(in_odom)
+
+
+def test_what_loops_say_comes_before_the_correction_of_the_graph(forest):
+    """map <- odom is (map <- odom of the start), which the graph knows, after (odom of the start <- odom of now)."""
+    _, events, heard = forest
+    turn = Rotation.from_euler("z", 0.1)
+    loops = MapFromOdom(
+        stamp_ns=0, p_map_odom=np.array([0.5, -0.2, 0.1]), q_map_odom=turn.as_quat(scalar_first=True), closures=1
+    )
+    begun = [e for e in events if e[0] < 4 * 10**9]
+    with_loops = run([(0, loops), *begun])[topics.SMOOTHED.name]
+    alone = {s.stamp_ns: s for s in heard[topics.SMOOTHED.name]}
+    assert len(with_loops) > 10
+    for s in with_loops:
+        R, R_alone = (rotation_from_quaternion(m.q_map_odom) for m in (s, alone[s.stamp_ns]))
+        np.testing.assert_allclose(R, R_alone @ turn.as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(s.p_map_odom, R_alone @ loops.p_map_odom + alone[s.stamp_ns].p_map_odom, atol=1e-9)
+        spin = R @ R_alone.T
+        np.testing.assert_allclose(s.v_map, spin @ alone[s.stamp_ns].v_map, atol=1e-9)
 
 
 def test_map_odom_moves_without_jumps(forest):
