@@ -11,8 +11,8 @@ demo: $(STAMP)
 
 # What needs no quiet machine runs twice as fast in two processes; what flies in real time runs alone.
 test: $(STAMP)
-	$(VENV)/bin/python -m pytest tests/unit tests/structure -n 2 --dist loadfile -p no:benchmark
-	$(VENV)/bin/python -m pytest tests/flights tests/live tests/bench
+	$(VENV)/bin/python -m pytest tests/flights tests/unit tests/structure -n 2 --dist loadfile -p no:benchmark
+	$(VENV)/bin/python -m pytest tests/live tests/bench
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
