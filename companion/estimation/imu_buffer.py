@@ -8,6 +8,7 @@ from companion.core.messages import Array, ImuSample
 
 _CAPACITY = 4096  # 20 s at 200 Hz
 _LEAP_NS = 1_000_000_000
+_BACK_IN_A_ROW = 10  # samples older than the newest, one after the other: the clock went back
 _LONGEST_STEP_S = 0.02  # longer gaps are bridged in steps of this length
 
 
@@ -21,6 +22,8 @@ class ImuBuffer:
         self._values = np.empty((_CAPACITY, 6))
         self._count = 0
         self._leap_ns = -(2**62)
+        self._behind: list[int] = []  # stamps of samples in a row that are older than the newest, ascending
+        self._hidden: tuple[int, int] = (-(2**62), 0)  # stamp of the first sample after such a row, and its time
         self.refused = 0
 
     def append(self, sample: ImuSample) -> bool:
@@ -43,7 +46,11 @@ class ImuBuffer:
         """Newer, and not far ahead unless the one before said so, too: one wild stamp must not stop us."""
         before, self._leap_ns = self._leap_ns, -(2**62)
         if stamp_ns <= self.newest_ns:
+            self._behind = [s for s in self._behind if s < stamp_ns] + [stamp_ns]
             return False
+        if len(self._behind) >= _BACK_IN_A_ROW:
+            self._hidden = stamp_ns, stamp_ns - self._behind[0]
+        self._behind.clear()
         if not self._count or stamp_ns - self.newest_ns < _LEAP_NS or 0 < stamp_ns - before < _LEAP_NS:
             return True
         self._leap_ns = stamp_ns
@@ -58,18 +65,30 @@ class ImuBuffer:
         return int(self._stamps[self._count - 1]) if self._count else -(2**62)
 
     @property
+    def newest_gap_s(self) -> float:
+        """Time between the two newest samples, as `longest_gap_s` has it; 0 before there are two."""
+        if self._count < 2:
+            return 0.0
+        hidden_ns = self._hidden[1] if self._hidden[0] == self.newest_ns else 0
+        return max(self.newest_ns - int(self._stamps[self._count - 2]), hidden_ns) * 1e-9
+
+    @property
     def newest_rate(self) -> Array:
         """Angular velocity of the newest sample, rad/s, (3,), biased."""
         return self._values[self._count - 1, :3].copy()
 
     def longest_gap_s(self, start_ns: int, end_ns: int) -> float:
-        """Of the samples that fill (start, end], the longest time between two, in s."""
+        """Of the samples that fill (start, end], the longest time between two, in s.
+
+        Time that the clock went back by, and so was there twice, counts: what happened then is not in the samples.
+        """
+        hidden_s = self._hidden[1] * 1e-9 if start_ns < self._hidden[0] <= end_ns else 0.0
         stamps = self._stamps[: self._count]
         first = max(int(np.searchsorted(stamps, start_ns, side="right")) - 1, 0)
         inside = stamps[first : int(np.searchsorted(stamps, end_ns)) + 1]
         if not len(inside):
-            return (end_ns - start_ns) * 1e-9
-        return float(np.diff(np.append(inside, max(end_ns, int(inside[-1])))).max()) * 1e-9
+            return max((end_ns - start_ns) * 1e-9, hidden_s)
+        return max(float(np.diff(np.append(inside, max(end_ns, int(inside[-1])))).max()) * 1e-9, hidden_s)
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the buffer reaches back to a time."""

@@ -7,6 +7,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from companion.core.messages import Array
 from companion.estimation.filter import Filter
 from companion.estimation.imu_buffer import ImuBuffer
 
@@ -21,6 +22,7 @@ class ImuDoubtConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     gap_s: Positive = 0.03  # between samples: longer is a gap
     gap_accel_m_s2: Positive = 3.0  # sigma of what a gap hides
     gap_rate_rad_s: Positive = 0.5
+    clock_s: Positive = 0.1  # a longer gap may be none: the clock jumped, and the way flown in it is none, or twice
     surprise: Positive = 8.0  # squared Mahalanobis distance of a sweep's correction; usually 1, seldom 5
     in_a_row: Annotated[int, msgspec.Meta(ge=1)] = 3
     bias_accel_m_s2: Positive = 0.3  # sigma that is added after a jump
@@ -31,6 +33,18 @@ class ImuDoubtConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 def new_buffer(config: ImuDoubtConfig) -> ImuBuffer:
     """A buffer that refuses what a sensor at its stop says."""
     return ImuBuffer(most_rate_rad_s=config.most_rate_rad_s, most_force_m_s2=config.most_force_m_s2)
+
+
+def gap_covariance(gap_s: float, v_odom: Array, config: ImuDoubtConfig) -> Array:
+    """What a gap adds to that of attitude, position and velocity, (9, 9); where a clock may have jumped, also the way.
+
+    Stamps alone do not tell silence from a clock that was set: with the one v dt was flown, with the other nothing.
+    """
+    rate, accel = config.gap_rate_rad_s, config.gap_accel_m_s2
+    added = np.diag(np.repeat([rate * gap_s, 0.5 * accel * gap_s**2, accel * gap_s], 3) ** 2)
+    if gap_s > config.clock_s:
+        added[3:6, 3:6] += np.outer(v_odom, v_odom) * gap_s**2
+    return added
 
 
 class ImuDoubt:
@@ -47,11 +61,9 @@ class ImuDoubt:
 
     def gap(self, filter_: Filter, gap_s: float) -> None:
         """No sample for a while, bridged by the next one."""
-        c = self._config
-        if gap_s <= c.gap_s:
+        if gap_s <= self._config.gap_s:
             return
-        sigmas = np.repeat([c.gap_rate_rad_s * gap_s, 0.5 * c.gap_accel_m_s2 * gap_s**2, c.gap_accel_m_s2 * gap_s], 3)
-        filter_.P[np.arange(9), np.arange(9)] += sigmas**2
+        filter_.P[:9, :9] += gap_covariance(gap_s, filter_.state.v, self._config)
         self._tell(filter_.t_s, f"IMU silent for {gap_s:.2f} s")
 
     def corrected(self, filter_: Filter) -> None:

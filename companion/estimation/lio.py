@@ -104,6 +104,8 @@ class Lio:
             self._nodes = np.concatenate([self._nodes, nodes])[-_NODE_HISTORY:]
             self._standing.watch(imu, self.filter)
             self._imu_doubt.gap(self.filter, gap_s)
+        if gap_s > self.config.imu_doubt.clock_s:  # the next sweep looks around, as after a gap without sweeps
+            self._scan_s = -np.inf
 
     def update_lidar(self, points_sensor: Array32, age_s: Array32) -> ScanResult:
         """Take a sweep (N, 3) that ends now; `age_s` (N,) is now minus each point's time."""

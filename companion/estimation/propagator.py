@@ -10,7 +10,7 @@ from companion.core.geometry import quaternion_from_rotation, rotation_from_quat
 from companion.core.messages import Array, ImuSample, LioState, Odometry
 from companion.estimation.config import PropagatorConfig
 from companion.estimation.health import judge
-from companion.estimation.imu_buffer import ImuBuffer
+from companion.estimation.imu_doubt import ImuDoubtConfig, gap_covariance, new_buffer
 from companion.estimation.propagation import ImuNoise, propagate
 from companion.estimation.state import STATE, State
 
@@ -22,9 +22,9 @@ class Propagator:
     feels, and smoothing would give the velocity a lag.
     """
 
-    def __init__(self, config: PropagatorConfig, noise: ImuNoise, imu: ImuBuffer) -> None:
-        self._config, self._densities = config, noise.densities
-        self._imu = imu
+    def __init__(self, config: PropagatorConfig, noise: ImuNoise, doubt: ImuDoubtConfig) -> None:
+        self._config, self._densities, self._doubt = config, noise.densities, doubt
+        self._imu = new_buffer(doubt)
         self._state: State | None = None
         self._P = np.empty((0, 0))
         self._time_ns = self._base_ns = self._scan_ns = 0
@@ -46,7 +46,7 @@ class Propagator:
         self._state, self._P = _unpack(state), state.covariance.copy()
         self._time_ns = self._base_ns = state.stamp_ns
         if len(self._imu):
-            self._run_to(self._imu.newest_ns)
+            self._run_to(self._imu.newest_ns, self._imu.longest_gap_s(self._time_ns, self._imu.newest_ns))
         if state.source != "start" and np.linalg.norm(self._state.p - before) > self._config.reset_from_m:
             self._resets += 1
 
@@ -54,17 +54,19 @@ class Propagator:
         """Take an IMU sample; the odometry at its stamp when one is due."""
         if not self._imu.append(sample) or self._state is None:
             return None
-        self._run_to(sample.stamp_ns)
+        self._run_to(sample.stamp_ns, self._imu.newest_gap_s)
         half_ns = 500_000_000 / self._config.rate_hz
         if sample.stamp_ns < self._time_ns or sample.stamp_ns - self._published_ns < 1.5 * half_ns:
             return None
         self._published_ns = sample.stamp_ns
         return self._odometry(self._state)
 
-    def _run_to(self, stamp_ns: int) -> None:
+    def _run_to(self, stamp_ns: int, gap_s: float) -> None:
         pieces = self._imu.between(self._time_ns, stamp_ns)
         if len(pieces) and self._state is not None:
             propagate(self._state, self._P, pieces, self._densities, t_s=0.0)
+            if gap_s > self._doubt.gap_s:
+                self._P[:9, :9] += gap_covariance(gap_s, self._state.v, self._doubt)
             self._time_ns = stamp_ns
 
     def _odometry(self, state: State) -> Odometry:

@@ -8,7 +8,6 @@ from companion.core.messages import ImuSample, LioState
 from companion.core.node import Node, Output, on
 from companion.core.topics import IMU, LIO_STATE, ODOMETRY
 from companion.estimation.config import EstimationConfig
-from companion.estimation.imu_doubt import new_buffer
 from companion.estimation.propagator import Propagator
 
 
@@ -18,7 +17,7 @@ class PropagatorNode(Node):
     publishes = (ODOMETRY,)
 
     def __init__(self, config: EstimationConfig) -> None:
-        self._propagator = Propagator(config.propagator, config.lio.noise, new_buffer(config.lio.imu_doubt))
+        self._propagator = Propagator(config.propagator, config.lio.noise, config.lio.imu_doubt)
 
     @on(IMU)
     def imu(self, sample: ImuSample) -> Iterator[Output]:

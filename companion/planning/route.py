@@ -27,7 +27,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 class RouteConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How a route is looked for."""
 
-    planner: PlannerName = "rrt_star"
+    planner: PlannerName = "portfolio"
     """Which planner looks for it."""
     map_margin_m: Metres = 0.1
     """Added to the clearance: cells are coarse."""

@@ -36,6 +36,11 @@ class Run:
     scans: int = 0
     cpu_s: dict[str, float] = field(default_factory=dict)
 
+    def forget_from(self, stamp_ns: int) -> None:
+        """The clock went back: what was before has the same stamps as what comes."""
+        for kept in (self.truth, self.states, self.odometry, self.smoothed):
+            del kept[next((k for k, m in enumerate(kept) if m.stamp_ns >= stamp_ns), len(kept)) :]
+
     def cpu_ms_per_scan(self, *nodes: str) -> float:
         """CPU time of these nodes, per sweep; with none given, of all."""
         return 1e3 * sum(s for n, s in self.cpu_s.items() if not nodes or n in nodes) / max(self.scans, 1)
@@ -61,7 +66,7 @@ def feed(
     for time_ns, topic, heard_message in messages:
         if time_ns > until_s * 1e9:
             break
-        message = spoil(topic, heard_message) if spoil and topic is not topics.TRUTH else heard_message
+        message = spoil(topic, heard_message) if spoil else heard_message
         if message is not None:
             _deliver(run, nodes, topic, message)
             if topic is topics.LIDAR:
@@ -92,5 +97,7 @@ def _keep(run: Run, topic: Topic[Any], message: Any) -> None:
         topics.SMOOTHED.name: run.smoothed,
         topics.WHY.name: run.why,
     }
+    if topic is topics.TRUTH and run.truth and message.stamp_ns <= run.truth[-1].stamp_ns:
+        run.forget_from(message.stamp_ns)
     if topic.name in lists:
         lists[topic.name].append(message)

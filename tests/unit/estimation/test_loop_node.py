@@ -136,9 +136,9 @@ def test_switched_off_or_fed_nonsense_it_says_nothing(lap):
     assert CORRECTIONS in LoopNode.publishes
 
 
-def test_only_maps_hear_of_loops_so_that_no_setpoint_can_step():
+def test_only_maps_and_the_frame_of_goals_hear_of_loops_so_that_no_setpoint_can_step():
     """Odometry, plans and setpoints come from nodes that know neither corrections nor `map_from_odom`."""
     hearing = {n.__name__ for n in NODES if {CORRECTIONS, MAP_FROM_ODOM} & set(n.subscribes)}
     moving = {n.__name__ for n in NODES if {ODOMETRY, LIO_STATE, REGISTERED, SETPOINT, TRAJECTORY} & set(n.publishes)}
-    assert hearing == {"MappingNode", "LandmarkNode"}
+    assert hearing == {"MappingNode", "LandmarkNode", "GraphNode"}
     assert not hearing & moving

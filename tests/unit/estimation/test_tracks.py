@@ -105,6 +105,8 @@ def hover(world, seconds, height_m=2.0):
             q_odom_body=q,
         )
         told = [o.message for o in node.handle(REGISTERED, scan) if o.topic is OBSTACLE_TRACKS]
+        for tracks in told:
+            list(mapping.handle(OBSTACLE_TRACKS, tracks))
         for out in mapping.handle(REGISTERED, scan):
             if out.topic is LOCAL_MAP:
                 list(node.handle(LOCAL_MAP, out.message))
