@@ -61,6 +61,9 @@ class GraphNode(Node):
         stamp_ns = likelihood.stamp_ns
         if stamp_ns - self._time_ns < _NEAREST_NS:
             stamp_ns = self._time_ns
+        if self._imu.longest_gap_s(self._time_ns, stamp_ns) > self._config.lio.imu_doubt.clock_s:
+            yield from self._begin_again(stamp_ns, "all sensors were silent, or the clock has jumped")
+            return
         imu = self._imu.between(self._time_ns, stamp_ns)
         try:
             self._smoother.add(imu, likelihood, t_s=(stamp_ns - self._zero_ns) * 1e-9)

@@ -104,7 +104,7 @@ class ImuBuffer:
 
         A sample is the mean over the interval that ends at its stamp, so the pieces at both
         ends are cut; what is missing at the end is bridged with the newest sample, and gaps
-        in between with the sample that follows them.
+        in between by interpolation.
         """
         if end_ns <= start_ns or not self._count:
             return np.empty((0, 7))
@@ -118,11 +118,40 @@ class ImuBuffer:
         pieces[0, 0] = ends[0] - start_ns
         pieces[:, 0] *= 1e-9
         pieces[:, 1:] = self._values[first : last + 1]
-        return pieces if pieces[:, 0].max() <= _LONGEST_STEP_S else _split(pieces)
+        return pieces if pieces[:, 0].max() <= _LONGEST_STEP_S else self._split(pieces, start_ns)
 
+    def is_clock_in_doubt(self, start_ns: int, end_ns: int, *, longer_s: float) -> bool:
+        """Whether silence of more than `longer_s` began and ended in between, with all sensors: or a clock was set."""
+        if start_ns < self._hidden[0] <= end_ns:
+            return True
+        stamps = self._stamps[: self._count]
+        inside = stamps[int(np.searchsorted(stamps, start_ns)) : int(np.searchsorted(stamps, end_ns, side="right"))]
+        return len(inside) > 1 and bool(np.diff(inside).max() > 1e9 * longer_s)
 
-def _split(pieces: Array) -> Array:
-    parts = np.ceil(pieces[:, 0] / _LONGEST_STEP_S).astype(np.int64)
-    split = np.repeat(pieces, parts, axis=0)
-    split[:, 0] /= np.repeat(parts, parts)
-    return split
+    def had_the_clock_jumped(self, start_ns: int, end_ns: int, *, longer_s: float) -> Array:
+        """`between`, if stamps lie: silence of more than `longer_s` was none, and what was there twice was flown."""
+        pieces: Array = self.between(start_ns, end_ns)
+        ends_ns = start_ns + np.round(1e9 * pieces[:, 0].cumsum()).astype(np.int64)
+        stamps = self._stamps[: self._count]
+        after = np.minimum(np.searchsorted(stamps, ends_ns - 1000), self._count - 1)  # 1000: rounding
+        silent = stamps[after] - stamps[np.maximum(after - 1, 0)] > 1e9 * longer_s
+        if not start_ns < self._hidden[0] <= end_ns:
+            spoken: Array = pieces[~silent]
+            return spoken
+        at = int(np.searchsorted(ends_ns, self._hidden[0] - 1000))
+        steps = int(np.ceil(self._hidden[1] * 1e-9 / _LONGEST_STEP_S))
+        flown = np.linspace(pieces[max(at - 1, 0)], pieces[min(at, len(pieces) - 1)], steps)
+        flown[:, 0] = self._hidden[1] * 1e-9 / steps
+        inserted: Array = np.insert(pieces, at, flown, axis=0)
+        return inserted
+
+    def _split(self, pieces: Array, start_ns: int) -> Array:
+        """No piece longer than `_LONGEST_STEP_S`; the parts of one lie between the samples before and after."""
+        parts = np.ceil(pieces[:, 0] / _LONGEST_STEP_S).astype(np.int64)
+        split = np.repeat(pieces, parts, axis=0)
+        split[:, 0] /= np.repeat(parts, parts)
+        middle_ns = start_ns + 1e9 * (split[:, 0].cumsum() - 0.5 * split[:, 0])
+        stamps = self._stamps[: self._count].astype(np.float64)
+        for k in np.flatnonzero(np.repeat(parts > 1, parts)):
+            split[k, 1:] = [np.interp(middle_ns[k], stamps, v) for v in self._values[: self._count].T]
+        return split

@@ -18,24 +18,28 @@ from companion.core.messages import Array, Array32, Bytes2D
 from companion.core.rig import Rig
 from companion.estimation.blind_axes import BlindAxes, BlindAxesConfig, BlindDrift
 from companion.estimation.camera import CameraConfig, CameraTracker
-from companion.estimation.deskew import ScanGate, deskew_directions, deskew_points, move_nodes
+from companion.estimation.clock_doubt import ClockDoubt
+from companion.estimation.course import Course
+from companion.estimation.deskew import ScanGate
 from companion.estimation.direct_camera import DirectCamera
 from companion.estimation.downsample import Thinner
 from companion.estimation.features import EdgeMap, EdgesAndPlanes, EdgesConfig, Registration
 from companion.estimation.filter import Filter, Linearise
+from companion.estimation.fit_watch import FitWatch
 from companion.estimation.imu_doubt import ImuDoubt, ImuDoubtConfig
 from companion.estimation.lines import LineConfig, LineRegistration
 from companion.estimation.map_error import MapError, MapErrorConfig
 from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap, PointMapConfig
-from companion.estimation.propagation import NODE, ImuNoise
+from companion.estimation.propagation import ImuNoise
 from companion.estimation.registration import PlaneConfig, PlaneRegistration
 from companion.estimation.search import SearchConfig, few_of, search
 from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
-_NODE_HISTORY = 160  # 0.8 s at 200 Hz
+_MET = 0.05  # of a sweep's points: fewer on the map say nothing
+_SURELY = 0.4  # of a sweep's points on the map: it tells which course is right
 
 
 class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -76,15 +80,16 @@ class Lio:
 
     def __init__(self, start: Filter, config: LioConfig, rig: Rig, camera: CameraConfig | None = None) -> None:
         self.filter, self.config = start, config
+        self._course = Course(start)
         self.map = PointMap(config.map)
         self._map_error, self._track_error = MapError(), MapError()
         self._scan_s = self._looked_s = start.t_s  # when the last sweep was used, and came
         self._back_s: float | None = None  # when sweeps came back after a gap
-        self._imu_doubt = ImuDoubt(config.imu_doubt)
+        self._imu_doubt, self._clock = ImuDoubt(config.imu_doubt), ClockDoubt()
+        self._watch, self._silent = FitWatch(), False  # silent: the IMU, during the newest sweep or image
         self._blind, self._drift = BlindAxes(config.blind), BlindDrift(config.blind)
         self._image_s = -np.inf  # when the last image was of use
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
-        self._nodes = np.empty((0, NODE))
         self._thinner = Thinner()
         self._edges = EdgeMap(config.edges, rig.lidar) if config.features == "edges_and_planes" else None
         self._densities = config.noise.densities
@@ -97,36 +102,37 @@ class Lio:
         """Start from rate and specific force of a vehicle that stands still, (N, 6)."""
         return cls(start_filter(samples, config.start, t_s=0.0), config, rig, camera)
 
-    def predict(self, imu: Array, *, gap_s: float = 0.0) -> None:
-        """Advance through IMU pieces (N, 7): dt, rate, specific force; `gap_s`: the longest time between samples."""
+    def predict(self, imu: Array, *, gap_s: float = 0.0, otherwise: Array | None = None) -> None:
+        """Advance through IMU pieces (N, 7): dt, rate, specific force; `gap_s`: the longest time without a sample.
+
+        `otherwise`: the pieces, if what looks like silence is a clock that was set; None: it does not look like that.
+        """
+        self._clock.predict(imu, self._densities)
+        if otherwise is not None:
+            self._clock.arise(self._course, otherwise, self._densities)
         if len(imu):
-            nodes = self.filter.predict(imu, self._densities)
-            self._nodes = np.concatenate([self._nodes, nodes])[-_NODE_HISTORY:]
+            self._course.predict(imu, self._densities)
             self._standing.watch(imu, self.filter)
             self._imu_doubt.gap(self.filter, gap_s)
-        if gap_s > self.config.imu_doubt.clock_s:  # the next sweep looks around, as after a gap without sweeps
-            self._scan_s = -np.inf
+            self._silent = gap_s > self.config.imu_doubt.gap_s
+            self._watch.doubts |= self._silent
 
     def update_lidar(self, points_sensor: Array32, age_s: Array32) -> ScanResult:
         """Take a sweep (N, 3) that ends now; `age_s` (N,) is now minus each point's time."""
-        state = self.filter.state
-        points_body = deskew_points(
-            points_sensor,
-            age_s,
-            self._history(),
-            pose_end=(state.R, state.p),
-            t_end_s=self.filter.t_s,
-            mount=self._mount,
-            gate=self.config.gate,
-        )
+        sweep = points_sensor, age_s, self._mount, self.config.gate
+        self._clock.settle(self._course, lambda c: self._fits(c, c.deskewed(*sweep)), at_least=_SURELY)
+        points_body = self._course.deskewed(*sweep)
         edges_body = self._edges.find(points_body) if self._edges else np.empty((0, 3))
         normal = self._register(points_body, edges_body) if self.map.voxels else None
         if normal is None and self.map.voxels:
             return ScanResult(points_body, None, agrees=False)
         spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
         if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):
-            self._extend(spaced, edges_body)
+            if not self._silent:  # nobody knows how the vehicle turned meanwhile, so the sweep is smeared
+                self._extend(spaced, edges_body)
             self._scan_s, self._back_s = self.filter.t_s, None
+            if normal is not None:
+                self._watch.took(normal)
         return ScanResult(points_body, normal)
 
     @property
@@ -143,20 +149,15 @@ class Lio:
 
     def turn_directions(self, dirs_sensor: Array32, age_s: Array32) -> Array32:
         """Directions (N, 3) of a sweep that ends now -> the body frame of now."""
-        return deskew_directions(
-            dirs_sensor,
-            age_s,
-            self._history(),
-            R_end=self.filter.state.R,
-            t_end_s=self.filter.t_s,
-            R_body_sensor=self._mount[0],
-        )
+        return self._course.directions(dirs_sensor, age_s, self._mount[0])
 
     def update_camera(self, pixels: Bytes2D) -> Normal | None:
-        """Take an image exposed now, (H, W); None if no point could be tracked into it."""
-        before = self._pose()
+        """Take an image exposed now, (H, W); None if no point could be tracked into it, or nobody knows the time."""
+        if self._clock.is_open:
+            return None
+        before = self._course.pose()
         normal = self._tracker.update(pixels, self.filter, self.map, self.config.plane)
-        move_nodes(self._nodes, before, self._pose())
+        self._course.moved(before)
         self._image_s = self._image_s if normal is None else self.filter.t_s
         if self.filter.t_s - self._scan_s > self.config.lidar_out_s or self._blind.shift is not None:
             self._track_error.move(self.filter.state.p)
@@ -175,16 +176,17 @@ class Lio:
     def _register(self, points_body: Array32, edges_body: Array) -> Normal | None:
         """What the sweep said; None: it came after a gap, does not fit the map, and corrected nothing."""
         self._take_back_drift()
-        before, prior = self._pose(), (self.filter.state.copy(), self.filter.P)
+        before, prior = self._course.pose(), (self.filter.state.copy(), self.filter.P)
         few = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
         c = self.config
         scan = self._registration(few, edges_body, (c.plane, c.edges.line))
         found = self._found(few, edges_body)
         normal = self.filter.update(self._softened(scan), iterations=c.iterations, at_least=c.min_planes, begin=found)
-        if self._is_back() and not self._agrees(scan):
+        self._watch.doubts |= self._watch.falls(normal) and self._contradicts(scan)
+        if self._is_back() and not self._agrees(scan, prior[1]):
             self.filter.state.x[:], self.filter.P = prior[0].x, prior[1]
             return None
-        move_nodes(self._nodes, before, self._pose())
+        self._course.moved(before)
         self._standing.seen(normal)
         self._swept = normal
         self._blind.seen()
@@ -207,25 +209,43 @@ class Lio:
         """After a gap, where registration is to begin; None: where the filter is."""
         if not self._is_back():
             return None
-        P, state, c = self.filter.P, self.filter.state, self.config.search
-        sigma_m = float(np.sqrt(max(P[3, 3], P[4, 4])))
+        return self._looked_for(self.filter, points_body, edges_body)[:2]
+
+    def _fits(self, course: Course, points_body: Array32) -> float:
+        """Share of a sweep's points that lie on the map, where they do best about the pose of a course."""
+        edges_body = self._edges.find(points_body) if self._edges else np.empty((0, 3))
+        thin = self._thinner.centroids(points_body, self.config.thin_m, at_most=self.config.points)
+        return self._looked_for(course.filter, thin, edges_body)[2]
+
+    def _looked_for(self, about: Filter, points_body: Array, edges_body: Array) -> tuple[Array, Array, float]:
+        P, c = about.P, self.config.search
         few, edges = few_of(points_body, c), few_of(edges_body, c)
-        pose = (state.R.copy(), state.p.copy())
+        pose, sigma_m = (about.state.R.copy(), about.state.p.copy()), float(np.sqrt(max(P[3, 3], P[4, 4])))
         how = c.plane, c.line
-        return search(lambda: self._registration(few, edges, how), pose, sigma_m=sigma_m, config=c)[:2]
+        return search(lambda: self._registration(few, edges, how), pose, sigma_m=sigma_m, config=c)
 
     def _is_back(self) -> bool:
-        """Whether sweeps came back after a gap, and none has been used since."""
-        return self.filter.t_s - self._scan_s > self.config.search.after_s
+        """Whether sweeps came back after a gap, or clock, IMU or fit are in doubt, and none has been used since."""
+        late = self.filter.t_s - self._scan_s > self.config.search.after_s
+        return late or self._clock.is_open or self._watch.doubts
 
-    def _agrees(self, scan: Registration) -> bool:
-        """Most of what meets the map must lie on it; after a while without, the map goes on from here."""
+    def _agrees(self, scan: Registration, P: Array) -> bool:
+        """Most of what meets the map must lie on it; after a while without, the map goes on from here.
+
+        It goes on with the error that the vehicle may have by then, covariance P: no sweep ever mends that.
+        """
         state, c = self.filter.state, self.config.search
         self._back_s = self.filter.t_s if self._back_s is None else self._back_s
-        if self.filter.t_s - self._back_s > c.hold_s:
+        if self.filter.t_s - self._back_s > c.hold_s and not self._clock.is_open:
+            self._map_error.extend(state, P, 1.0)
             return True
         fitting, met, offered = scan.fits(state.R, state.p, c.fits_m)
-        return met > 0.05 * offered and fitting / met > c.agree_share
+        return met > _MET * offered and fitting / met > c.agree_share
+
+    def _contradicts(self, scan: Registration) -> bool:
+        """Enough meets the map, and most of that lies beside it."""
+        fitting, met, offered = scan.fits(self.filter.state.R, self.filter.state.p, self.config.search.fits_m)
+        return bool(met > _MET * offered and fitting <= self.config.search.agree_share * met)
 
     def _take_back_drift(self) -> None:
         """What camera or IMU alone may have drifted, a sweep that sees can mend: it is the filter's then."""
@@ -251,13 +271,3 @@ class Lio:
     def _is_known(self, normal: Normal) -> bool:
         """Whether the map should have explained the scan; a nearly empty one cannot."""
         return normal.offered > 0 and self.map.voxels > 4 * normal.offered
-
-    def _history(self) -> Array:
-        """The nodes passed, and the state of now, so that nothing is extrapolated from afar."""
-        now = np.zeros((1, NODE))
-        now[0, 0], now[0, 1:16] = self.filter.t_s, self.filter.state.x[:15]
-        return np.concatenate([self._nodes, now])
-
-    def _pose(self) -> tuple[Array, Array, Array]:
-        state = self.filter.state
-        return state.R.copy(), state.p.copy(), state.v.copy()

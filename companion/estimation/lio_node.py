@@ -105,8 +105,11 @@ class LioNode(Node):
                 yield self._why("start again", "the filter's numbers are no longer finite")
 
     def _advance(self, lio: Lio, stamp_ns: int) -> None:
-        gap_s = self._imu.longest_gap_s(self._time_ns, stamp_ns)
-        lio.predict(self._imu.between(self._time_ns, stamp_ns), gap_s=gap_s)
+        when, longer_s = (self._time_ns, stamp_ns), self._config.lio.imu_doubt.clock_s
+        gap_s, otherwise = self._imu.longest_gap_s(*when), None
+        if gap_s > longer_s and self._imu.is_clock_in_doubt(*when, longer_s=longer_s):
+            otherwise = self._imu.had_the_clock_jumped(*when, longer_s=longer_s)
+        lio.predict(self._imu.between(*when), gap_s=gap_s, otherwise=otherwise)
         self._time_ns = stamp_ns
         lio.filter.t_s = (stamp_ns - self._zero_ns) * 1e-9  # no rounding adds up
 

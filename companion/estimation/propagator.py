@@ -10,7 +10,7 @@ from companion.core.geometry import quaternion_from_rotation, rotation_from_quat
 from companion.core.messages import Array, ImuSample, LioState, Odometry
 from companion.estimation.config import PropagatorConfig
 from companion.estimation.health import judge
-from companion.estimation.imu_doubt import ImuDoubtConfig, gap_covariance, new_buffer
+from companion.estimation.imu_doubt import ImuDoubtConfig, clock_covariance, gap_covariance, new_buffer
 from companion.estimation.propagation import ImuNoise, propagate
 from companion.estimation.state import STATE, State
 
@@ -66,7 +66,8 @@ class Propagator:
         if len(pieces) and self._state is not None:
             propagate(self._state, self._P, pieces, self._densities, t_s=0.0)
             if gap_s > self._doubt.gap_s:
-                self._P[:9, :9] += gap_covariance(gap_s, self._state.v, self._doubt)
+                self._P[:9, :9] += gap_covariance(gap_s, self._doubt)
+                self._P[3:6, 3:6] += clock_covariance(gap_s, self._state.v, self._doubt)
             self._time_ns = stamp_ns
 
     def _odometry(self, state: State) -> Odometry:

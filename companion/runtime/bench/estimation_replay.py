@@ -38,7 +38,8 @@ class Run:
 
     def forget_from(self, stamp_ns: int) -> None:
         """The clock went back: what was before has the same stamps as what comes."""
-        for kept in (self.truth, self.states, self.odometry, self.smoothed):
+        lists: tuple[list[Any], ...] = (self.truth, self.states, self.odometry, self.smoothed)
+        for kept in lists:
             del kept[next((k for k, m in enumerate(kept) if m.stamp_ns >= stamp_ns), len(kept)) :]
 
     def cpu_ms_per_scan(self, *nodes: str) -> float:

@@ -41,11 +41,43 @@ def test_pieces_join_without_overlap():
     np.testing.assert_allclose(weighted, (whole[:, :1] * whole[:, 1:]).sum(axis=0), rtol=1e-12)
 
 
-def test_gaps_are_bridged_in_short_steps():
+def test_gaps_are_bridged_in_short_steps_between_the_samples_around_them():
     pieces = filled([0, 5, 10, 110, 115]).between(5 * MS, 115 * MS)
     assert pieces[:, 0].max() <= 0.02
     assert pieces[:, 0].sum() == pytest.approx(0.11)
-    assert (pieces[1:6, 1] == 110).all()
+    np.testing.assert_allclose(pieces[:, 1], [10, 20, 40, 60, 80, 100, 115])
+
+
+def test_silence_of_all_sensors_may_be_a_clock_that_was_set_forward():
+    buffer = filled([*range(0, 105, 5), *range(405, 505, 5)])
+    when = (90 * MS, 450 * MS)
+    assert buffer.longest_gap_s(*when) == pytest.approx(0.305)
+    assert buffer.is_clock_in_doubt(*when, longer_s=0.05)
+    assert not buffer.is_clock_in_doubt(150 * MS, 450 * MS, longer_s=0.05)  # another sensor spoke meanwhile
+    pieces = buffer.had_the_clock_jumped(*when, longer_s=0.05)
+    assert pieces[:, 0].sum() == pytest.approx(0.36 - 0.305)
+    np.testing.assert_allclose(pieces[:, 1], [95, 100, *range(410, 455, 5)])
+
+
+def test_time_that_was_there_twice_is_hidden_and_flown_if_the_clock_went_back():
+    buffer = filled([*range(0, 505, 5), *range(200, 605, 5)])
+    when = (490 * MS, 520 * MS)
+    assert buffer.longest_gap_s(*when) == pytest.approx(0.305)  # from 200 to the first that is new
+    assert buffer.newest_gap_s == pytest.approx(0.005)
+    assert buffer.is_clock_in_doubt(*when, longer_s=0.05)
+    assert not buffer.is_clock_in_doubt(510 * MS, 520 * MS, longer_s=0.05)
+    pieces = buffer.had_the_clock_jumped(*when, longer_s=0.05)
+    assert pieces[:, 0].sum() == pytest.approx(0.03 + 0.305)
+    assert ((pieces[:, 1] >= 495) & (pieces[:, 1] <= 520)).all()
+
+
+def test_late_samples_between_newer_ones_are_no_clock_that_went_back():
+    buffer = ImuBuffer()
+    for s in range(0, 500, 5):
+        buffer.append(sample(s))
+        buffer.append(sample(max(s - 15, 0)))
+    assert not buffer.is_clock_in_doubt(0, 495 * MS, longer_s=0.05)
+    assert buffer.longest_gap_s(0, 495 * MS) == pytest.approx(0.005)
 
 
 def test_bad_samples_are_refused():
