@@ -9,6 +9,7 @@ from companion.core.messages import Array, ImuSample
 _CAPACITY = 4096  # 20 s at 200 Hz
 _LEAP_NS = 1_000_000_000
 _BACK_IN_A_ROW = 10  # samples older than the newest, one after the other: the clock went back
+_SOON_NS = 20_000_000  # a leap is believed one sample after the measurement that leapt with it
 _LONGEST_STEP_S = 0.02  # longer gaps are bridged in steps of this length
 
 
@@ -125,7 +126,8 @@ class ImuBuffer:
         if start_ns < self._hidden[0] <= end_ns:
             return True
         stamps = self._stamps[: self._count]
-        inside = stamps[int(np.searchsorted(stamps, start_ns)) : int(np.searchsorted(stamps, end_ns, side="right"))]
+        last = int(np.searchsorted(stamps, end_ns + _SOON_NS, side="right"))
+        inside = stamps[int(np.searchsorted(stamps, start_ns)) : last]
         return len(inside) > 1 and bool(np.diff(inside).max() > 1e9 * longer_s)
 
     def had_the_clock_jumped(self, start_ns: int, end_ns: int, *, longer_s: float) -> Array:

@@ -38,6 +38,7 @@ from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
+_HALF = 0.55  # of what meets the map, at least, lies on it where registration is right
 _MET = 0.05  # of a sweep's points: fewer on the map say nothing
 _SURELY = 0.4  # of a sweep's points on the map: it tells which course is right
 
@@ -93,7 +94,7 @@ class Lio:
         self._thinner = Thinner()
         self._edges = EdgeMap(config.edges, rig.lidar) if config.features == "edges_and_planes" else None
         self._densities = config.noise.densities
-        self._standing = Standing(start, config.standing)
+        self._standing = Standing(start, config.standing, self._densities)
         self._swept: Normal | None = None  # what the newest sweep said
         self._tracker = self._camera_of(camera or CameraConfig(), rig)
 
@@ -245,7 +246,7 @@ class Lio:
     def _contradicts(self, scan: Registration) -> bool:
         """Enough meets the map, and most of that lies beside it."""
         fitting, met, offered = scan.fits(self.filter.state.R, self.filter.state.p, self.config.search.fits_m)
-        return bool(met > _MET * offered and fitting <= self.config.search.agree_share * met)
+        return bool(met > _MET * offered and fitting <= _HALF * met)
 
     def _take_back_drift(self) -> None:
         """What camera or IMU alone may have drifted, a sweep that sees can mend: it is the filter's then."""
@@ -262,9 +263,14 @@ class Lio:
 
     def _extend(self, spaced: Array32, edges_body: Array) -> None:
         state = self.filter.state
+        seen = (spaced, edges_body, state.R.copy(), state.p.copy())
+        settled = self._standing.settled(self.filter.t_s, seen) if self.map.voxels else seen
+        if settled is None:
+            return
+        spaced, edges_body, R, p = settled
         if self._edges is not None:
-            self._edges.insert(edges_body, state.R, state.p)
-        share = self.map.insert(spaced, state.R, state.p) / max(len(spaced), 1)
+            self._edges.insert(edges_body, R, p)
+        share = self.map.insert(spaced, R, p) / max(len(spaced), 1)
         self._map_error.move(state.p)
         self._map_error.extend(state, self.filter.P, share * self.config.map_error.share)
 

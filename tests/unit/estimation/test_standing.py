@@ -21,7 +21,7 @@ def pieces(rng, extra=(0, 0, 0, 0, 0, 0), n=20):
 def held():
     rng = np.random.default_rng(3)
     filter_ = start_filter(pieces(rng, n=200)[:, 1:], StartConfig(), t_s=0.0)
-    return rng, filter_, Standing(filter_, StandingConfig())
+    return rng, filter_, Standing(filter_, StandingConfig(), ImuNoise().densities)
 
 
 def run(rng, filter_, standing, seconds, extra=(0, 0, 0, 0, 0, 0)):
@@ -47,6 +47,30 @@ def test_it_learns_the_gyro_bias_while_it_stands(held):
     run(rng, filter_, standing, 20.0)
     assert filter_.P[9, 9] < 0.1 * before
     assert np.abs(filter_.state.gyro_bias - REST[:3]).max() < 4 * np.sqrt(filter_.P[9, 9])
+
+
+def test_what_moved_before_it_was_known_to_move_is_not_held_down(held):
+    """It tips by 8 mrad in 0.2 s: that is told, though the filter was held for most of it."""
+    rng, filter_, standing = held
+    run(rng, filter_, standing, 5.0)
+    R = filter_.state.R.copy()
+    run(rng, filter_, standing, 0.2, (0.04, 0, 0, 0, 0, 0))
+    run(rng, filter_, standing, 0.1, (0, 0, 0, 0, 0, 1.0))
+    assert standing.is_over
+    tipped = R.T @ filter_.state.R
+    assert tipped[2, 1] == pytest.approx(0.008, abs=0.0015)
+    assert np.linalg.eigvalsh(filter_.P)[0] > 0
+
+
+def test_sweeps_are_settled_when_it_is_known_that_it_stood(held):
+    rng, filter_, standing = held
+    given = []
+    for k in range(12):
+        run(rng, filter_, standing, 0.1)
+        given.append(standing.settled(0.125 * k, k))
+    assert given == [None] * 4 + list(range(8))
+    run(rng, filter_, standing, 0.3, (0, 0, 0, 0, 0, 1.0))
+    assert standing.settled(1.5, 15) == 15
 
 
 @pytest.mark.parametrize("extra", [(0, 0, 0, 0, 0, 0.6), (0, 0, 0, 0.4, 0, 0), (0, 0, 0.05, 0, 0, 0)])
