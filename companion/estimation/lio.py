@@ -38,7 +38,6 @@ from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
-_HALF = 0.55  # of what meets the map, at least, lies on it where registration is right
 _MET = 0.05  # of a sweep's points: fewer on the map say nothing
 _SURELY = 0.4  # of a sweep's points on the map: it tells which course is right
 
@@ -241,12 +240,13 @@ class Lio:
             self._map_error.extend(state, P, 1.0)
             return True
         fitting, met, offered = scan.fits(state.R, state.p, c.fits_m)
-        return met > _MET * offered and fitting / met > c.agree_share
+        doubted = self._clock.is_open or self._watch.doubts
+        return met > _MET * offered and fitting > (c.doubted_share if doubted else c.agree_share) * met
 
     def _contradicts(self, scan: Registration) -> bool:
         """Enough meets the map, and most of that lies beside it."""
         fitting, met, offered = scan.fits(self.filter.state.R, self.filter.state.p, self.config.search.fits_m)
-        return bool(met > _MET * offered and fitting <= _HALF * met)
+        return bool(met > _MET * offered and fitting <= self.config.search.agree_share * met)
 
     def _take_back_drift(self) -> None:
         """What camera or IMU alone may have drifted, a sweep that sees can mend: it is the filter's then."""

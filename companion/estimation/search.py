@@ -31,7 +31,8 @@ class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     plane: PlaneConfig = PlaneConfig(sigma_m=0.15, neighbour_m=1.0)
     line: LineConfig = LineConfig(sigma_m=0.15)  # where edges are registered, too
     fits_m: Positive = 0.06  # a point this near to its plane fits
-    agree_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.85  # of the points with a plane must fit
+    agree_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.55  # of the points with a plane must fit
+    doubted_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.85  # the same, if clock or IMU are in doubt, too
     hold_s: Annotated[float, msgspec.Meta(ge=0)] = 2.0  # for so long sweeps that do not agree are left out
 
 
