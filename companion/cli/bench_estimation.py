@@ -48,6 +48,9 @@ def estimation(
     recordings: Annotated[Path | None, typer.Option(help="Where flights are kept and found again.")] = None,
     flight: Annotated[Path | None, typer.Option(help="A flight flown with --record instead.")] = None,
     with_peers: Annotated[bool, typer.Option("--peers/--no-peers", help="KISS-ICP and small_gicp, too.")] = True,
+    peers_until_s: Annotated[
+        float, typer.Option(min=1, help="Flown seconds that peers get: KISS-ICP may take a second for a sweep.")
+    ] = 40.0,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override, sim.* of what is recorded, too; repeatable.")
     ] = None,
@@ -67,12 +70,12 @@ def estimation(
         Console(stderr=True).print(f"no {', '.join(missing())}: pip install 'understory\\[bench]'", style="dim")
     config, console = stack_config(None, tuple(set_ or ())), Console()
     own = [o for o in set_ or () if o.startswith("sim.")]
-    plain = as_json or not console.is_terminal
+    plain, peers_s = as_json or not console.is_terminal, peers_until_s if with_peers else 0.0
     with tempfile.TemporaryDirectory() as scratch:
         folders = (
             [(flight, flight.name)] if flight else _folders(courses, speeds, seeds, recordings or Path(scratch), own)
         )
-        done = list(written(_rows(folders, asked, config, with_peers=with_peers), out=out, plain=plain))
+        done = list(written(_rows(folders, asked, config, peers_s), out=out, plain=plain))
     if not plain:
         console.print(estimation_table(done))
 
@@ -81,11 +84,10 @@ def _rows(
     folders: Sequence[tuple[Path, str]] | Iterator[tuple[Path, str]],
     faults: list[str],
     config: Config,
-    *,
-    with_peers: bool,
+    peers_s: float,
 ) -> Iterator[EstimationRow]:
     for folder, name in folders:
-        yield from bench_flight(folder, name, faults, config, with_peers=with_peers)
+        yield from bench_flight(folder, name, faults, config, peers_until_s=peers_s)
 
 
 def _folders(courses: str, speeds: str, seeds: str, parent: Path, own: list[str]) -> Iterator[tuple[Path, str]]:

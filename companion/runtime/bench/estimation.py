@@ -55,12 +55,19 @@ class EstimationRow(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
 
 
 def bench_flight(
-    folder: Path, flight: str, faults: Sequence[str], config: Config, *, with_peers: bool
+    folder: Path, flight: str, faults: Sequence[str], config: Config, *, peers_until_s: float
 ) -> Iterator[EstimationRow]:
-    """One row per fault, and one per peer on the flight without faults."""
+    """One row per fault, and one per peer on the flight without faults, up to `peers_until_s`; 0: no peers."""
     for text in faults:
-        others = peers(max_range_m=PEER_RANGE_M) if with_peers and text == "none" else {}
-        run = feed(heard(folder), config.estimation, config.rig, spoil=fault(text), others=list(others.values()))
+        others = peers(max_range_m=PEER_RANGE_M) if peers_until_s > 0.0 and text == "none" else {}
+        run = feed(
+            heard(folder),
+            config.estimation,
+            config.rig,
+            spoil=fault(text),
+            others=list(others.values()),
+            others_until_s=peers_until_s,
+        )
         yield own_row(run, flight, text, true_biases(folder))
         for name, peer in others.items():
             yield peer_row(name, peer, run, flight, config.rig)

@@ -56,10 +56,11 @@ def feed(
     with_graph: bool = True,
     others: Sequence[Peer] = (),
     until_s: float = float("inf"),
+    others_until_s: float = float("inf"),
 ) -> Run:
     """Feed messages (arrival time in ns, topic, message) to fresh nodes, in their order; compute takes no time here.
 
-    `others` get each sweep right after the nodes, so that all run under the same conditions.
+    `others` get each sweep right after the nodes, so that all run under the same conditions, up to `others_until_s`.
     """
     run = Run()
     nodes: list[Node] = [LioNode(config, rig), PropagatorNode(config)]
@@ -72,7 +73,7 @@ def feed(
             _deliver(run, nodes, topic, message)
             if topic is topics.LIDAR:
                 run.scans += 1
-                for other in others:
+                for other in others if time_ns <= others_until_s * 1e9 else ():
                     other.register(message)
     return run
 
