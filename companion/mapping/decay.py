@@ -12,7 +12,8 @@ others, the evidence for these is cut to even odds, so that the next look decide
 decays: a branch loses a cell or two at a time, what walks leaves many.
 
 Where a track of something that moves has just been (`companion.mapping.walked`) no crowd is needed,
-and nothing becomes proven: a slow walker is hit twice in the same cell.
+and nothing becomes proven: a slow walker is hit twice in the same cell. If that track is elsewhere by
+now, newcomers become again what they were before it came: free.
 
 Of what is proven, rays that pass through count in every fourth scan only (`MISSES_COUNT_EVERY`): a twig
 that a few scans in a hundred hit stays, and what was proven and leaves anyway stays for up to 12 s.
@@ -84,9 +85,10 @@ class Decay:
 
 
 def decay(
-    voxels: VoxelMap, now_ns: int, config: DecayConfig, *, since_ns: int, cylinders: Array = NOBODY
+    voxels: VoxelMap, now_ns: int, config: DecayConfig, *, since_ns: int, cylinders: tuple[Array, Array] = NOBODY
 ) -> NDArray[np.int32]:
-    """One pass at `now_ns`; the last one was at `since_ns`; `cylinders` (K, 5) say where something moved.
+    """One pass at `now_ns`; the last one was at `since_ns`; `cylinders` (K, 5), (L, 5) say where something moved,
+    and where something may still be.
 
     Returns the positions (K, 3) of the blocks in which a cell changed its class. Raises InputError
     when the map was not made for it.
@@ -97,10 +99,12 @@ def decay(
     rows = np.flatnonzero(blocks.stirred[: blocks.count])
     changed = np.zeros(len(rows), np.bool_)
     kept = blocks.held if not config.erase_loaded else np.zeros_like(blocks.held)
-    newcomers, walked = np.zeros(len(rows), np.int64), walked_cells(blocks.xyz[rows], cylinders)
+    newcomers = np.zeros(len(rows), np.int64)
+    walked, occupied = (walked_cells(blocks.xyz[rows], part) for part in cylinders)
+    left = walked & ~occupied
     _count_newcomers(rows, blocks.marks, blocks.log_odds, walked, newcomers)
     crowded = _crowded(blocks, rows, newcomers, config.crowd)
-    _pass(rows, blocks.marks, (blocks.log_odds, kept), (config.crowd, crowded, walked), changed)
+    _pass(rows, blocks.marks, (blocks.log_odds, kept), (config.crowd, crowded, walked, left), changed)
     rows = rows[changed]
     if config.forget_unseen_s > 0.0:
         rows = np.concatenate([rows, _forget_unseen(voxels, now_ns, since_ns, config)])
@@ -148,7 +152,7 @@ def _count_newcomers(rows, marked, log_odds, walked, newcomers):  # type: ignore
 @njit(cache=True, nogil=True)
 def _pass(rows, marked, cells, crowds, changed):  # type: ignore[no-untyped-def]
     (_, slots, stirred, (bits, free, left)), (log_odds, held) = marked, cells
-    crowd, crowded, walked = crowds
+    crowd, crowded, walked, was_left = crowds
     gone, weak, occupied = np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64), np.empty(WORDS, np.uint64)
     for n in range(rows.size):
         stirred[rows[n]] -= 1
@@ -171,7 +175,7 @@ def _pass(rows, marked, cells, crowds, changed):  # type: ignore[no-untyped-def]
             elif passed < crowd:
                 weak[w] &= walked[n, w]
             if gone[w] | weak[w] != u64(0):
-                _lower(levels, 64 * w, (gone[w], weak[w]), keep)
+                _lower(levels, 64 * w, (gone[w], weak[w]), ~u64(0) if keep else was_left[n, w])
                 changed[n] |= gone[w] != u64(0)
             _turn(marks, w, occupied[w] & ~gone[w])
             left_over |= occupied[w] & ~gone[w]
@@ -224,12 +228,12 @@ def _occupied(octets, w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lower(levels, first, bits, keep):  # type: ignore[no-untyped-def]
-    """Forget the cells of `gone`; bring those of `weak` down to even odds."""
+def _lower(levels, first, bits, free):  # type: ignore[no-untyped-def]
+    """Forget the cells of `gone` (those of `free` are free again); bring those of `weak` down to even odds."""
     gone, weak = bits
     for c in range(64):
         one = u64(1) << u64(c)
         if gone & one != u64(0):
-            levels[first + c] = -1 if keep else UNKNOWN
+            levels[first + c] = -1 if free & one != u64(0) else UNKNOWN
         elif weak & one != u64(0):
             levels[first + c] = 0

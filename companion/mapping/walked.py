@@ -13,9 +13,11 @@ from companion.mapping.rays import BLOCK, WORDS
 
 u64 = np.uint64
 _LEAST_SPEED = 0.3  # m/s: what is slower may be a branch in the wind
+_FRESH_NS = 500_000_000  # what was told longer ago says nothing of now
 _HALF_HEIGHT_M = 2.0  # above and below the middle of what is seen of it
 _MARGIN_M = 0.3  # of a walker often one side alone is seen
-NOBODY: Array = np.empty((0, 5))  # no cylinders
+_AWAY_M, _AWAY_SIGMAS = 0.2, 3.0  # beyond that, and what is known of its place: it is not there
+NOBODY: tuple[Array, Array] = (np.empty((0, 5)), np.empty((0, 5)))  # no cylinders
 
 
 class Walked:
@@ -23,23 +25,44 @@ class Walked:
 
     def __init__(self, keep_s: float) -> None:
         self._keep_ns = round(1e9 * keep_s)
-        self._seen: deque[tuple[int, Array]] = deque()
+        self._seen: deque[tuple[int, NDArray[np.int64], Array]] = deque()
+        self._newest: ObstacleTracks | None = None
 
     def take(self, tracks: ObstacleTracks) -> None:
         """Note where its tracks are; those that hardly move are none."""
+        self._newest = tracks
         moves = np.linalg.norm(tracks.velocity_odom, axis=1) >= _LEAST_SPEED
         if moves.any():
             seen = np.column_stack([tracks.position_odom[moves], tracks.radius_m[moves] + _MARGIN_M])
-            self._seen.append((tracks.stamp_ns, seen))
+            self._seen.append((tracks.stamp_ns, tracks.id[moves], seen))
 
-    def cylinders(self, now_ns: int, cell_m: float) -> Array:
-        """(K, 5): x and y, radius squared, lowest and highest z, all in cells."""
+    def cylinders(self, now_ns: int, cell_m: float) -> tuple[Array, Array]:
+        """Where things that move have been, and where one may still be: (K, 5), (L, 5), in cells.
+
+        x and y, radius squared, lowest and highest z. One that is still tracked is there; of a lost one nobody knows.
+        """
+        if self._newest is not None and now_ns - self._newest.stamp_ns > _FRESH_NS:
+            self._newest = None
         while self._seen and self._seen[0][0] < now_ns - self._keep_ns:
             self._seen.popleft()
-        seen = np.concatenate([np.empty((0, 4)), *(rows for _, rows in self._seen)]) / cell_m
-        reach = _HALF_HEIGHT_M / cell_m
-        parts = [seen[:, :2], seen[:, 3] ** 2, seen[:, 2] - reach, seen[:, 2] + reach]
-        return np.ascontiguousarray(np.column_stack(parts))  # one layout: a kernel is compiled for each
+        seen = np.concatenate([np.empty((0, 4)), *(rows for _, _, rows in self._seen)])
+        ids = np.concatenate([np.empty(0, np.int64), *(ids for _, ids, _ in self._seen)])
+        told = np.isin(ids, self._newest.id) if self._newest else np.zeros(len(ids), np.bool_)
+        return _upright(seen, cell_m), _upright(np.concatenate([seen[~told], self._here()]), cell_m)
+
+    def _here(self) -> Array:
+        """Place and radius (N, 4) of the tracks that are told, as far as they may be from there."""
+        if self._newest is None:
+            return np.empty((0, 4))
+        wide_m = self._newest.radius_m + _MARGIN_M + _AWAY_M + _AWAY_SIGMAS * np.sqrt(self._newest.position_variance)
+        return np.column_stack([self._newest.position_odom, wide_m])
+
+
+def _upright(seen: Array, cell_m: float) -> Array:
+    """Cylinders (K, 5) about places and radii (K, 4), m."""
+    at, reach = seen / cell_m, _HALF_HEIGHT_M / cell_m
+    parts = [at[:, :2], at[:, 3] ** 2, at[:, 2] - reach, at[:, 2] + reach]
+    return np.ascontiguousarray(np.column_stack(parts))  # one layout: a kernel is compiled for each
 
 
 def walked_cells(block_xyz: NDArray[np.int32], cylinders: Array) -> NDArray[np.uint64]:

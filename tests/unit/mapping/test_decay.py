@@ -1,5 +1,7 @@
 """Decay: what has left goes, seen or not; what stays, stays; a loaded map is not erased."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -132,6 +134,21 @@ def test_where_something_moved_no_crowd_is_needed(track, state):
     if track:
         m.decay.take(walks_at(*track, stamp_ns=m.now_ns))
     m.see([[-5.0, 0.0, 0.0]], 30)
+    assert m.classes(FRONT[:1]) == [state]
+
+
+@pytest.mark.parametrize(
+    ("now_at", "variance", "state"), [(9.0, 0.01, 1), (4.6, 0.01, 0), (9.0, 4.0, 0), (None, 0.01, 0)]
+)
+def test_what_is_tracked_elsewhere_by_now_leaves_free_space_and_what_is_lost_leaves_unknown(now_at, variance, state):
+    """Before it came the space was free. A track that may still be there, or is told no more, does not count."""
+    m = Mapper().see(WALL, 12).see(FRONT[:1], 8)
+    m.decay.take(walks_at(4.1, 0.1, stamp_ns=m.now_ns))
+    for _ in range(20):
+        if now_at is not None:
+            elsewhere = walks_at(now_at, 0.1, stamp_ns=m.now_ns)
+            m.decay.take(replace(elsewhere, position_variance=np.full(1, variance)))
+        m.see([[-5.0, 0.0, 0.0]])
     assert m.classes(FRONT[:1]) == [state]
 
 
