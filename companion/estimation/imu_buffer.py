@@ -23,7 +23,7 @@ class ImuBuffer:
         self._values = np.empty((_CAPACITY, 6))
         self._count = 0
         self._leap_ns = -(2**62)
-        self._behind: list[int] = []  # stamps of samples in a row that are older than the newest, ascending
+        self._behind = (0, 0, 0)  # first and last stamp, and count, of ascending samples in a row older than the newest
         self._hidden: tuple[int, int] = (-(2**62), 0)  # stamp of the first sample after such a row, and its time
         self.refused = 0
 
@@ -47,11 +47,13 @@ class ImuBuffer:
         """Newer, and not far ahead unless the one before said so, too: one wild stamp must not stop us."""
         before, self._leap_ns = self._leap_ns, -(2**62)
         if stamp_ns <= self.newest_ns:
-            self._behind = [s for s in self._behind if s < stamp_ns] + [stamp_ns]
+            first, last, count = self._behind
+            follows = count > 0 and stamp_ns > last
+            self._behind = (first, stamp_ns, count + 1) if follows else (stamp_ns, stamp_ns, 1)
             return False
-        if len(self._behind) >= _BACK_IN_A_ROW:
+        if self._behind[2] >= _BACK_IN_A_ROW:
             self._hidden = stamp_ns, stamp_ns - self._behind[0]
-        self._behind.clear()
+        self._behind = (0, 0, 0)
         if not self._count or stamp_ns - self.newest_ns < _LEAP_NS or 0 < stamp_ns - before < _LEAP_NS:
             return True
         self._leap_ns = stamp_ns
