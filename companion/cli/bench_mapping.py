@@ -33,6 +33,10 @@ def mapping(
     scans: Annotated[int, typer.Option(min=1, max=200, help="Scans of the agreement with OctoMap.")] = 200,
     rounds: Annotated[int, typer.Option(min=1, max=100, help="Rounds of each, smallest times count.")] = 5,
     data: Annotated[Path, typer.Option(help="Folder with the real scans lidar_*.")] = Path("data"),
+    prototype: Annotated[
+        Path | None,
+        typer.Option(help="Python file with another map, VoxMap: it takes its turn, its ratio is the target."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -44,7 +48,7 @@ def mapping(
     console, done = Console(), list[MappingRow]()
     plain = as_json or not console.is_terminal
     check_out(out)
-    measured = bench_mapping(rows or [], Options(scans=scans, rounds=rounds, data=data))
+    measured = bench_mapping(rows or [], Options(scans=scans, rounds=rounds, data=data, prototype=prototype))
     for row in written(measured, out=out, plain=plain):
         done.append(row)
         if not plain:

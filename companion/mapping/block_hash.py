@@ -7,6 +7,8 @@ from numba import njit
 
 i64, u64 = np.int64, np.uint64
 EMPTY = -1  # key of a slot that is not in use
+_STRIDE = 17  # slots from try to try: past the neighbours, whose slots are taken, and odd, so that all have their turn
+_STRIDES_PER_SLOT = u64(pow(_STRIDE, -1, 1 << 64))
 
 
 @njit(cache=True, nogil=True)
@@ -40,9 +42,10 @@ def make_scratch(met, grid, table, count, rows):  # type: ignore[no-untyped-def]
 def _place(number, grid):  # type: ignore[no-untyped-def]
     """Position of a scratch block."""
     side, corner = grid
-    i, rest = divmod(number, side * side)
-    j, k = divmod(rest, side)
-    return i + corner[0], j + corner[1], k + corner[2]
+    block, wide = np.uint32(number), np.uint32(side)
+    line = block // wide
+    i = line // wide
+    return i64(i) + corner[0], i64(line - i * wide) + corner[1], i64(block - line * wide) + corner[2]
 
 
 @njit(cache=True, nogil=True)
@@ -70,15 +73,21 @@ def leave(xyz, rows, keys, values):  # type: ignore[no-untyped-def]
     mask = i64(keys.size - 1)
     for row in rows:
         gap = slot_of(keys, i64(xyz[row, 0]), i64(xyz[row, 1]), i64(xyz[row, 2]))
-        slot = (gap + 1) & mask
+        slot = (gap + _STRIDE) & mask
         while keys[slot] != EMPTY:
             other = values[slot]
             home = _home(mask, i64(xyz[other, 0]), i64(xyz[other, 1]), i64(xyz[other, 2]))
-            if ((slot - home) & mask) >= ((slot - gap) & mask):
+            if _tries(slot - home, mask) >= _tries(slot - gap, mask):
                 keys[gap], values[gap] = keys[slot], values[slot]
                 gap = slot
-            slot = (slot + 1) & mask
+            slot = (slot + _STRIDE) & mask
         keys[gap] = EMPTY
+
+
+@njit(cache=True, nogil=True)
+def _tries(slots, mask):  # type: ignore[no-untyped-def]
+    """How many tries farther a slot is that is so many slots farther."""
+    return i64(u64(slots) * _STRIDES_PER_SLOT) & mask
 
 
 @njit(cache=True, nogil=True)
@@ -88,7 +97,7 @@ def slot_of(keys, x, y, z):  # type: ignore[no-untyped-def]
     mask = i64(keys.size - 1)
     slot = _home(mask, x, y, z)
     while keys[slot] != key and keys[slot] != EMPTY:
-        slot = (slot + 1) & mask
+        slot = (slot + _STRIDE) & mask
     return slot
 
 

@@ -15,14 +15,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from companion.core.messages import Array, Array32
-from companion.mapping.lanes import FRACTION, LANES, write_indices
-from companion.mapping.ray_lines import COUNT, FINE, FIRST, HITS, LAST, SIGN, TILE, ends, line_scratch, planes, slopes
+from companion.mapping.lanes import LANES
+from companion.mapping.ray_indices import families
+from companion.mapping.ray_lines import HITS, LAST, TILE, cut_bits, ends, line_scratch, planes, slopes
 
 u8, u32, u64 = np.uint8, np.uint32, np.uint64  # unsigned: no negative-index handling in kernels
 BLOCK = 8  # voxels per block edge; 8^3 bits are one cache line
 CELLS = BLOCK**3
 WORDS = CELLS // 64
-_CUT = FINE - FRACTION  # bits cut off where 32 must do
 _STRIDES = (BLOCK * BLOCK, BLOCK, 1)  # of x, y, z inside a block
 _INSIDE = 2  # blocks of slack around the farthest voxel
 ScanBits = tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.int32]]
@@ -51,6 +51,7 @@ class RayGrid:
         self.corner = np.zeros(3, np.int64)
         self._reached = np.zeros((2, 3), np.int64)  # lowest and highest cell of any bit
         self._row = np.zeros(TILE * 3 * BLOCK * self.side + LANES, np.uint32)
+        self._doubts = np.zeros(2 * TILE, np.int64)
         self._hit_rows = np.zeros(TILE, np.int64)
         self._lines = line_scratch()
         blocks = np.array([self.side**2, self.side, 1]) * CELLS
@@ -92,6 +93,8 @@ class RayGrid:
         are not used.
         """
         near, far_m, miss = ranges
+        if not len(vectors):
+            return 0, 0
         if not miss:
             self.make_room(len(vectors))
         bits = (self.free.view(np.uint8), (self._hit, self._hit_of, self.hit_count), self._reached)
@@ -100,7 +103,7 @@ class RayGrid:
             to_grid,
             (near, far_m * (1.0 / self.resolution_m), miss),
             bits,
-            (self._row, self._hit_rows),
+            (self._row, self._doubts, self._hit_rows),
             self._layout,
             self._lines,
         )
@@ -153,18 +156,19 @@ def _cast(vectors, pose, ranges, bits, scratch, layout, lines):  # type: ignore[
     """Tile by tile: the lines of its rays, then the indices of their voxels, then the bits."""
     free, hit, reached = bits
     R, offset, origin = pose
-    start, whole, (row, hit_rows) = (origin[0], origin[1], origin[2]), lines[2], scratch
+    start, whole, (row, doubts, hit_rows) = (origin[0], origin[1], origin[2]), lines[3], scratch
     turn = (R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2])
     flat_pose = (turn, (offset[0], offset[1], offset[2]), start)
     used = steps = 0
     for first in range(0, vectors.size // 3, TILE):
         count = min(TILE, vectors.size // 3 - first)
         used += ends(vectors, (first, count), flat_pose, ranges, lines)
-        planes(count, start, lines)
+        planes(count, start, lines, layout[2].shape[2])
         for axis in range(3):
             slopes(count, start, lines, axis)
+        cut_bits(lines)
         _reach(reached, whole, count)
-        end = _families(row, count, lines, layout)
+        end = families((row, doubts), count, lines, layout)
         steps += _set_bits(free, row[:end])
         _set_ends(free, hit, _ends(row, count, whole, layout[2]), hit_rows)
     if used > 0:
@@ -179,62 +183,6 @@ def _reach(reached, whole, count):  # type: ignore[no-untyped-def]
         for n in range(LAST + k * TILE, LAST + k * TILE + count):
             low, high = min(low, whole[n]), max(high, whole[n])
         reached[0, k], reached[1, k] = low, high
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _families(row, count, lines, layout):  # type: ignore[no-untyped-def]
-    """Indices of the voxels that `count` rays enter, at the planes of one axis after another; returns their end.
-
-    Writes whole lanes, so garbage may follow.
-    """
-    side = u32(layout[1])
-    x, y, z = (0, u32(6), u32(side * side)), (1, u32(3), side), (2, u32(0), u32(1))
-    end = _family(row, (0, count), lines, layout, (0, y, z))
-    end = _family(row, (end, count), lines, layout, (1, x, z))
-    return _family(row, (end, count), lines, layout, (2, x, y))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _family(row, span, lines, layout, axes):  # type: ignore[no-untyped-def]
-    """Those at the planes of one axis, from `row[end]` on; inlined, so that the axes are constants."""
-    (end, count), (_, fixed, whole), (strides, _, along) = span, lines, layout
-    axis, (axis_u, bit_u, apart_u), (axis_v, bit_v, apart_v) = axes
-    shares, at = along.reshape(-1), u64(4 * axis * TILE)
-    for m in range(count):
-        n = u64(m)
-        crossed, sign = whole[u64(COUNT + axis * TILE) + n], whole[u64(SIGN + axis * TILE) + n]
-        place = _place(along, axis, whole[FIRST + axis] + sign, sign)
-        u, v = fixed[at + n], fixed[at + u64(TILE) + n]
-        u_step, v_step = fixed[at + u64(2 * TILE) + n], fixed[at + u64(3 * TILE) + n]
-        in_u = (u32(u_step >> u64(_CUT)), bit_u, apart_u)
-        in_v = (u32(v_step >> u64(_CUT)), bit_v, apart_v)
-        for first in range(end, end + crossed, LANES):
-            now = (u32(u >> u64(_CUT)), u32(v >> u64(_CUT)))
-            if write_indices(row, first, now, in_u, in_v, shares, place) != u64(0):
-                _exact((row, first), (u, v), (u_step, v_step), (strides, axis_u, axis_v), (shares, place))
-            u, v, place = u + u64(LANES) * u_step, v + u64(LANES) * v_step, place + u64(LANES)
-        end += crossed
-    return end
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _exact(out, now, fixed_steps, layout, along):  # type: ignore[no-untyped-def]
-    """The same lanes in full precision."""
-    (row, first), (u, v), (u_step, v_step), (shares, place) = out, now, fixed_steps, along
-    strides, axis_u, axis_v = layout
-    su, bu, sv, bv = strides[0, axis_u], strides[1, axis_u], strides[0, axis_v], strides[1, axis_v]
-    for j in range(LANES):
-        k = u64(j)
-        iu = np.int64((u + k * u_step) >> u64(FINE))
-        iv = np.int64((v + k * v_step) >> u64(FINE))
-        row[first + j] = u32(shares[place + k] + iu * su + (iu >> 3) * bu + iv * sv + (iv >> 3) * bv)
-
-
-@njit(cache=True, nogil=True)
-def _place(along, axis, w, sign):  # type: ignore[no-untyped-def]
-    """Where the shares of cells w, w + sign, ... of an axis begin."""
-    cells = along.shape[2]
-    return u64(2 * axis * cells + LANES + w if sign > 0 else 2 * (axis + 1) * cells - LANES - 1 - w)
 
 
 @njit(cache=True, nogil=True)

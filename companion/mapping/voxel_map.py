@@ -155,7 +155,8 @@ class VoxelMap:
         grid = self._rays.grid
         self.memory.before_scan(grid.corner + grid.reach, grid.reach)
         hit, missed, steps = self._cast((points, own_radius_m), misses, (R, p - origin, origin))
-        grid.mark_free(free_odom[np.linalg.norm(free_odom - origin, axis=1) <= self.config.max_range_m])
+        if len(free_odom):
+            grid.mark_free(free_odom[np.linalg.norm(free_odom - origin, axis=1) <= self.config.max_range_m])
         met, changed = self.blocks.fold(grid, self.steps, stamp_ns, watch)
         return Delta(hit, missed, len(points) + len(misses) - hit - missed, steps, met, changed)
 
@@ -265,8 +266,8 @@ def _memory(voxels: VoxelMap) -> Memory:
 
 
 def _rows(vectors: Array32) -> Array32:
-    """A copy (N, 3), contiguous: a read-only array would be one more type to compile for."""
-    array = np.array(vectors, np.float32, order="C")
+    """(N, 3), contiguous, and a copy if it is read-only, which would be one more type to compile for."""
+    array = np.require(vectors, np.float32, ["C", "W"])
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"shape {array.shape} is no list of vectors", field="points", valid="(N, 3)")
     return array
@@ -274,7 +275,7 @@ def _rows(vectors: Array32) -> Array32:
 
 def _check_pose(**parts: Array) -> None:
     for name, part in parts.items():
-        if not np.all(np.abs(part) < _FARTHEST_M):
+        if not all(abs(number) < _FARTHEST_M for number in part.ravel().tolist()):
             raise InputError(f"{part.tolist()} is no pose", field=name, valid=f"finite, within {_FARTHEST_M:g} m")
 
 

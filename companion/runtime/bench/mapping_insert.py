@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from companion.core.messages import Array
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
-from companion.runtime.bench.mapping_peers import OCTOMAP_MODEL, OctoMap, RayPer, cpu_ms
+from companion.runtime.bench.mapping_peers import OCTOMAP_MODEL, Insertion, OctoMap, Prototype, RayPer, settled_cpu_ms
 from companion.runtime.bench.mapping_scans import Scan
 
 RANGE_M = 30.0
@@ -27,28 +27,38 @@ def like_octomap(resolution_m: float, ray_per: RayPer = "point") -> VoxelMapConf
 
 
 def time_insertion(
-    scans: list[Scan], resolution_m: float, *, rounds: int, ray_per: RayPer = "point"
+    scans: list[Scan],
+    resolution_m: float,
+    *,
+    rounds: int,
+    ray_per: RayPer = "point",
+    prototype: Prototype | None = None,
 ) -> dict[str, float]:
     """CPU ms per scan of both, in turns; the first scan, which fills an empty map, stands apart.
 
     Each round fills a new map and a new tree. Of each scan the smallest time over the rounds counts, then the
-    mean over the scans.
+    mean over the scans. A `prototype` takes its turn, too.
     """
-    taken = np.full((2, len(scans)), np.inf)
+    taken = np.full((2 if prototype is None else 3, len(scans)), np.inf)
     for _ in range(rounds):
         voxels, tree = VoxelMap(like_octomap(resolution_m, ray_per)), OctoMap(resolution_m, RANGE_M, ray_per=ray_per)
+        insertions: list[Insertion] = [lambda scan, to=voxels: partial(scan.into, to), tree.insertion]  # type: ignore[misc]
+        insertions += [] if prototype is None else [prototype.empty(resolution_m, RANGE_M)]
         for k, scan in enumerate(scans):
-            works = (partial(scan.into, voxels), tree.insertion(scan))
-            taken[:, k] = np.minimum(taken[:, k], [cpu_ms(work) for work in works])
-    ours, theirs = taken
-    return {
-        "ours_ms": float(ours[1:].mean()),
-        "peer_ms": float(theirs[1:].mean()),
-        "first_ours_ms": float(ours[0]),
-        "first_peer_ms": float(theirs[0]),
+            works = [insertion(scan) for insertion in insertions]
+            taken[:, k] = np.minimum(taken[:, k], [settled_cpu_ms(work) for work in works])
+    later = taken[:, 1:].mean(axis=1)
+    figures = {
+        "ours_ms": float(later[0]),
+        "peer_ms": float(later[1]),
+        "first_ours_ms": float(taken[0, 0]),
+        "first_peer_ms": float(taken[1, 0]),
         "returns": float(np.mean([len(s.points_body) for s in scans[1:]])),
         "rounds": float(rounds),
     }
+    if prototype is None:
+        return figures
+    return figures | {"prototype_ms": float(later[2]), "prototype_ratio": float(later[1] / later[2])}
 
 
 def time_threads(scans: list[Scan], resolution_m: float, *, rounds: int) -> dict[str, float]:

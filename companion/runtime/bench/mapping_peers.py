@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.core.errors import CompanionError
+from companion.core.errors import CompanionError, InputError
 from companion.core.messages import Array
 from companion.mapping.sensor_model import SensorModel
 from companion.runtime.bench.mapping_scans import Scan
 
+_REQUESTS, _REQUEST_BYTES = 300, 100_000  # small enough to be taken from what was freed
 RayPer = Literal["point", "end_voxel"]
+Insertion = Callable[[Scan], Callable[[], object]]
+"""For a scan the work that inserts it into a map."""
 OCTOMAP_MODEL = SensorModel(hit=0.7, miss=0.4, lowest=0.1192, highest=0.971)  # its own defaults
 
 
@@ -50,11 +55,44 @@ class OctoMap:
         return (labels.ravel() + 1).astype(np.uint8)
 
 
+class Prototype:
+    """A map of somebody else from a Python file, which has a class VoxMap.
+
+    VoxMap(resolution_m, range_m).insert(points_body (N, 3) float32, R_odom_body (3, 3), p_odom (3,)) takes a scan.
+    """
+
+    def __init__(self, file: Path) -> None:
+        """Import the file; InputError if there is none, or no such class in it."""
+        if file.suffix != ".py" or not file.is_file():
+            raise InputError("no such Python file", field="--prototype", file=str(file), valid="a .py file")
+        sys.path.insert(0, str(file.parent.resolve()))  # by its own name: Numba's cache knows it by that alone
+        module = import_module(file.stem)
+        if not hasattr(module, "VoxMap"):
+            raise InputError("no class VoxMap in it", field="--prototype", file=str(file), valid="a file that has one")
+        self._make = module.VoxMap
+
+    def empty(self, resolution_m: float, range_m: float) -> Insertion:
+        """Insertions into a new map."""
+        voxels = self._make(resolution_m, range_m)
+        return lambda scan: lambda: voxels.insert(scan.points_body, scan.R_odom_body, scan.p_odom)
+
+
 def cpu_ms(work: Callable[[], object]) -> float:
     """CPU time of one call in this process, ms."""
     started = time.process_time_ns()
     work()
     return (time.process_time_ns() - started) * 1e-6
+
+
+def settled_cpu_ms(work: Callable[[], object]) -> float:
+    """`cpu_ms` of work that finds the allocator tidy.
+
+    OctoMap frees a million small pieces per scan, which glibc sorts when others ask for memory, 10,000 at each
+    request: up to 15 ms of OctoMap's that the next in turn would be charged with.
+    """
+    for _ in range(_REQUESTS):
+        np.empty(_REQUEST_BYTES, np.uint8)
+    return cpu_ms(work)
 
 
 def alternate(works: dict[str, Callable[[], object]], *, rounds: int) -> dict[str, float]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from companion.mapping.block_hash import EMPTY, _home, _tries
 from companion.mapping.blocks import BlockStore
 from companion.mapping.rays import CELLS
 from companion.mapping.sensor_model import UNKNOWN
@@ -22,6 +23,21 @@ def held_in(store):
     """What the store says, by position."""
     rows = range(store.count)
     return {tuple(store.xyz[r].tolist()): (store.log_odds[r].tobytes(), int(store.held[r])) for r in rows}
+
+
+@pytest.mark.parametrize("shape", [(32, 32, 32), (180, 180, 1), (3, 3, 3600), (1, 1, 32_000)])
+def test_blocks_side_by_side_are_found_after_few_tries(shape):
+    """The last is a line: four neighbours share sixteen slots, so a quarter of the slots takes all."""
+    store = BlockStore()
+    xyz = np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1).astype(np.int32) - 1000
+    store.add(xyz, np.zeros((len(xyz), CELLS), np.int8), LOWEST, held=False)
+    keys, rows = store.table
+    slots = np.flatnonzero(keys != EMPTY)
+    homes = np.array([_home(len(keys) - 1, *store.xyz[row].tolist()) for row in rows[slots]])
+    tries = [_tries(int(apart), len(keys) - 1) for apart in slots - homes]
+    assert np.mean(tries) < 2.5
+    assert np.array_equal(store.rows_of(xyz), np.arange(len(xyz)))
+    assert not np.any(store.rows_of(xyz + [0, 40_000, 0]) >= 0)
 
 
 @pytest.mark.parametrize("seed", range(5))
