@@ -35,7 +35,7 @@ def mapping(
     data: Annotated[Path, typer.Option(help="Folder with the real scans lidar_*.")] = Path("data"),
     prototype: Annotated[
         Path | None,
-        typer.Option(help="Python file with another map, VoxMap: it takes its turn, its ratio is the target."),
+        typer.Option(help="Python file with another map, class VoxMap, that takes its turn at insertion."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the rows there, too, one JSON object per line.")] = None,
     as_json: Json = False,

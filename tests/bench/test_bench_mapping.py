@@ -14,6 +14,7 @@ from companion.runtime.bench.mapping import ROWS, Options, bench_mapping
 from companion.runtime.bench.mapping_correction import correction_figures
 from companion.runtime.bench.mapping_forest import DENSE, fly, make_forest
 from companion.runtime.bench.mapping_insert import agreement, like_octomap, time_insertion, time_threads
+from companion.runtime.bench.mapping_peers import Prototype
 from companion.runtime.bench.mapping_thin import thin_recall
 
 
@@ -80,3 +81,24 @@ def test_rows_that_do_not_exist_or_lack_their_data_say_so(tmp_path):
     rows = list(bench_mapping(names, Options(data=tmp_path)))
     assert [row.name for row in rows] == names
     assert all("--data" in row.skipped and row.ours_ms is None for row in rows)
+
+
+def test_another_map_from_a_file_takes_its_turn(tmp_path, scans):
+    engine = tmp_path / "engine_of_a_test.py"
+    engine.write_text(
+        "class VoxMap:\n"
+        "    def __init__(self, resolution_m, range_m):\n"
+        "        assert (resolution_m, range_m) == (0.4, 30.0)\n"
+        "    def insert(self, points_body, R_odom_body, p_odom):\n"
+        "        assert points_body.shape[1:] == (3,) and R_odom_body.shape == (3, 3) and p_odom.shape == (3,)\n"
+        "        sum(range(200_000))\n",
+        encoding="utf-8",
+    )
+    figures = time_insertion(scans[:2], 0.4, rounds=1, prototype=Prototype(engine))
+    assert figures["prototype_ms"] > 0.1
+    assert figures["prototype_ratio"] == pytest.approx(figures["peer_ms"] / figures["prototype_ms"])
+    for bad, text in ((tmp_path / "none.py", ""), (tmp_path / "no_map_in_it.py", "x = 1\n"), (tmp_path / "a.txt", "x")):
+        if text:
+            bad.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="prototype"):
+            Prototype(bad)

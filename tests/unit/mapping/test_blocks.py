@@ -37,7 +37,7 @@ def test_blocks_side_by_side_are_found_after_few_tries(shape):
     tries = [_tries(int(apart), len(keys) - 1) for apart in slots - homes]
     assert np.mean(tries) < 2.5
     assert np.array_equal(store.rows_of(xyz), np.arange(len(xyz)))
-    assert not np.any(store.rows_of(xyz + [0, 40_000, 0]) >= 0)
+    assert not np.any(store.rows_of(xyz + np.array([0, 40_000, 0])) >= 0)
 
 
 @pytest.mark.parametrize("seed", range(5))
