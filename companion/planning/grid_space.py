@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ class GridSpace:
         """Lower and upper corner, m."""
         return self.origin, self.origin + np.array(self.steps.shape) * self.resolution_m
 
-    @property
+    @cached_property
     def sample_box(self) -> Array:
         """Corners (2, 3) in cells; of no height in a plane world."""
         low, high = np.zeros(3), np.array(self.steps.shape, np.float64)

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.messages import Array
+from companion.planning import best_path, grow, shortcut
 from companion.planning import connect as two_trees
 from companion.planning import detour as other_side
-from companion.planning import grow, shortcut
 from companion.planning.planner import CellSpace, Plan, Planner, Query
 from companion.planning.polyline import length, without_repeats
-from companion.planning.tree import COST, NEVER, PARENT, drop_repeats, way_length, way_to
-from companion.planning.trees import FROM_GOAL, FROM_START, OWN, PATH_POINTS, Trees
+from companion.planning.tree import NEVER, PARENT, drop_repeats, way_to
+from companion.planning.trees import FROM_GOAL, FROM_START, OWN, Trees
 
 _SPARE_NODES = 2048  # for chains of known and shortened paths
 
@@ -92,8 +92,7 @@ class RRTStar(Planner):
     def _scratch(self, space: CellSpace, iterations: int) -> Trees:
         nodes = iterations + self.config.chunk + _SPARE_NODES
         bucket = self.config.bucket_m / space.resolution_m
-        shape: NDArray[np.int64] = np.array(space.steps.shape)
-        grid = tuple(int(n) for n in np.ceil(shape / bucket))
+        grid = tuple(math.ceil(cells / bucket) for cells in space.steps.shape)
         memory = self._memory
         if memory is None or memory.nodes.shape[1] < nodes or memory.heads.shape[1:] != grid:
             memory = self._memory = Trees.of(nodes, grid)
@@ -108,9 +107,10 @@ class Search:
         self.ends = space.to_cells(np.stack([start, goal]))  # (2, 3)
         self._bucket = config.bucket_m / space.resolution_m
         memory.plant(OWN, self.ends, self._bucket)
-        self._tree = (memory.nodes[0], memory.links[0], memory.heads[0])
         self._counts = np.array([2, 0, grow.START])
-        self._best, self._path = np.zeros((PATH_POINTS, 3)), memory.path
+        self._tree = (memory.nodes[OWN], memory.links[OWN], memory.heads[OWN])
+        self._hung = (*self._tree, self._counts, self._bucket)  # as the kernels of `best_path` take them
+        self._kept = self._best, self._path = memory.kept
         self.best_cost = NEVER
         self._forced = np.zeros((0, 3))
         self._box = space.sample_box
@@ -197,10 +197,7 @@ class Search:
 
     def _shorten(self, count: int, rng: np.random.Generator, attempts: int) -> None:
         draws = rng.random((attempts, shortcut.DRAWS))
-        count = shortcut.shorten(self._space.steps, self._path, count, draws)
-        if way_length(self._path, count) < self.best_cost - 1e-9:
-            self._hang(self._path[:count])
-            self._keep_if_better()
+        self.best_cost = best_path.better(self._space.steps, self._hung, self._kept, count, draws, self.best_cost)
 
     def result(self, iterations: int = 0) -> Plan:
         """The best path, or the way towards the goal as far as it goes."""
@@ -237,23 +234,15 @@ class Search:
         if self.solved:
             self._shorten(count, rng, self.config.restart_shortcuts)
         else:
-            self._hang(self._path[: drop_repeats(self._path, count)])
-            self._keep_if_better()
+            count = drop_repeats(self._path, count)
+            self.best_cost = best_path.take(self._hung, self._kept, count, self.best_cost)
         return True
 
     def _hang(self, path: Array) -> None:
         grow.add_chain(*self._tree, self._counts, self._bucket, np.ascontiguousarray(path))
 
     def _keep_if_better(self) -> None:
-        if self._tree[0][grow.GOAL, COST] < self.best_cost - 1e-9 and self._counts[grow.NODES] > 2:
-            count = self._way_to(grow.GOAL)
-            if count:
-                self._best[:count] = self._path[:count]
-                self._counts[grow.BEST] = count
-                self.best_cost = float(way_length(self._best, count))
-
-    def _way_to(self, node: int) -> int:
-        return int(way_to(self._tree[0], self._tree[1], node, self._path))
+        self.best_cost = best_path.keep(self._hung, self._kept, self.best_cost)
 
     def _near_goal(self) -> int:
         """Node of the start's tree nearest to the goal."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from companion.core.messages import Array
@@ -22,14 +23,14 @@ class Trees:
     nodes: Array
     links: NDArray[np.int32]
     heads: NDArray[np.int32]
-    path: Array  # scratch, (PATH_POINTS, 3)
+    kept: tuple[Array, Array]  # the best path, and scratch, (PATH_POINTS, 3) each
 
     @classmethod
     def of(cls, nodes: int, grid: tuple[Any, ...]) -> Trees:
         """Room for so many nodes each, and buckets of a `grid`."""
         links = np.full((3, nodes, 4), -1, np.int32)
         heads = np.full((3, *grid), -1, np.int32)
-        return cls(np.zeros((3, nodes, 4)), links, heads, np.zeros((PATH_POINTS, 3)))
+        return cls(np.zeros((3, nodes, 4)), links, heads, (np.zeros((PATH_POINTS, 3)), np.zeros((PATH_POINTS, 3))))
 
     @property
     def pair(self) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
@@ -38,8 +39,15 @@ class Trees:
 
     def plant(self, which: int, roots: Array, bucket: float) -> None:
         """Empty a tree and give it its roots (K, 3); only the first is found by searches."""
-        self.heads[which].fill(-1)
-        self.nodes[which, : len(roots), :3] = roots
-        self.nodes[which, : len(roots), COST] = NEVER
-        self.links[which, : len(roots)] = -1
-        add(self.nodes[which], self.links[which], self.heads[which], 0, -1, bucket)
+        _plant(self.nodes[which], self.links[which], self.heads[which], roots, bucket)
+
+
+@njit(cache=True, nogil=True)
+def _plant(nodes, links, head, roots, bucket):  # type: ignore[no-untyped-def]
+    head[:] = -1
+    for n in range(roots.shape[0]):
+        for k in range(3):
+            nodes[n, k] = roots[n, k]
+        nodes[n, COST] = NEVER
+        links[n, :] = -1
+    add(nodes, links, head, 0, -1, bucket)
