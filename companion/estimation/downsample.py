@@ -6,7 +6,10 @@ import numpy as np
 from numba import njit
 
 from companion.core.messages import Array, Array32
-from companion.estimation.voxels import pack, slot_of, table_size
+from companion.core.prefetch import prefetch
+from companion.estimation.voxels import home_of, pack, slot_of, table_size
+
+_AT_ONCE = 64  # points
 
 
 class Thinner:
@@ -42,10 +45,13 @@ class Thinner:
 @njit(cache=True, nogil=True)
 def _centroids(points, inverse, keys, value, out):  # type: ignore[no-untyped-def]
     n = points.shape[0]
-    used, weight = np.empty(n, np.uint64), np.empty(n, np.int64)
+    used, weight, of = np.empty(n, np.uint64), np.empty(n, np.int64), np.empty(_AT_ONCE, np.int64)
     m = 0
     for q in range(n):
-        s, key = _voxel(points, q, inverse, keys)
+        if q % _AT_ONCE == 0:
+            _ask_for_voxels(points[q : q + _AT_ONCE], inverse, keys, of)
+        key = of[q % _AT_ONCE]
+        s = slot_of(keys, key)
         if keys[s] == 0:
             keys[s], value[s], used[m], weight[m] = key, m, s, 0
             out[m, 0] = out[m, 1] = out[m, 2] = 0.0
@@ -62,10 +68,13 @@ def _centroids(points, inverse, keys, value, out):  # type: ignore[no-untyped-de
 @njit(cache=True, nogil=True)
 def _firsts(points, inverse, keys, index):  # type: ignore[no-untyped-def]
     n = points.shape[0]
-    used = np.empty(n, np.uint64)
+    used, of = np.empty(n, np.uint64), np.empty(_AT_ONCE, np.int64)
     m = 0
     for q in range(n):
-        s, key = _voxel(points, q, inverse, keys)
+        if q % _AT_ONCE == 0:
+            _ask_for_voxels(points[q : q + _AT_ONCE], inverse, keys, of)
+        key = of[q % _AT_ONCE]
+        s = slot_of(keys, key)
         if keys[s] == 0:
             keys[s], used[m], index[m] = key, s, q
             m += 1
@@ -75,9 +84,11 @@ def _firsts(points, inverse, keys, index):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _voxel(points, q, inverse, keys):  # type: ignore[no-untyped-def]
-    i = np.int64(np.floor(points[q, 0] * inverse))
-    j = np.int64(np.floor(points[q, 1] * inverse))
-    k = np.int64(np.floor(points[q, 2] * inverse))
-    key = pack(i, j, k)
-    return slot_of(keys, key), key
+def _ask_for_voxels(points, inverse, keys, of):  # type: ignore[no-untyped-def]
+    """Keys of the voxels that hold the points, and their places in the table asked of the memory."""
+    for m in range(points.shape[0]):
+        i = np.int64(np.floor(points[m, 0] * inverse))
+        j = np.int64(np.floor(points[m, 1] * inverse))
+        k = np.int64(np.floor(points[m, 2] * inverse))
+        of[m] = pack(i, j, k)
+        prefetch(keys, home_of(keys, of[m]))

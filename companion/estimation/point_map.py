@@ -13,9 +13,11 @@ import numpy as np
 from numba import njit
 
 from companion.core.messages import Array, Array32
-from companion.estimation.voxels import pack, slot_of, table_size
+from companion.core.prefetch import prefetch
+from companion.estimation.voxels import home_of, pack, slot_of, table_size
 
 _FIRST_VOXELS = 1 << 15
+_AT_ONCE = 64  # points
 
 
 class PointMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -84,45 +86,77 @@ def _refill(pool_keys, keys, value):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _insert(store, points, pose, limits):  # type: ignore[no-untyped-def]
-    keys, value, pool_keys, counts, pool, weights, voxels = store
-    R, p = pose
-    inverse, spacing2, averaged = limits
-    refused, added = 0, 0
-    for q in range(points.shape[0]):
-        a, b, c = np.float64(points[q, 0]), np.float64(points[q, 1]), np.float64(points[q, 2])
+    """Some points at once, in three passes: what the next will need is asked of the memory by the one before."""
+    at, of = np.empty((_AT_ONCE, 3)), np.empty(_AT_ONCE, np.int64)  # points in odom, keys of their voxels
+    voxels, refused, added = store[6], 0, 0
+    for first in range(0, points.shape[0], _AT_ONCE):
+        count = min(_AT_ONCE, points.shape[0] - first)
+        _carry(store, points[first : first + count], pose, limits[0], at, of)
+        _ask_for_voxels(store, of[:count])
+        voxels, lost, new = _put(store, voxels, at, of[:count], limits)
+        refused += lost
+        added += new
+    return voxels, refused, added
+
+
+@njit(cache=True, nogil=True)
+def _carry(store, points, pose, inverse, at, of):  # type: ignore[no-untyped-def]
+    (keys, value, _, _, _, _, _), (R, p) = store, pose
+    for m in range(points.shape[0]):
+        a, b, c = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
         x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0]
         y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + p[1]
         z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + p[2]
-        i, j, k = (
-            np.int64(np.floor(x * inverse)),
-            np.int64(np.floor(y * inverse)),
-            np.int64(np.floor(z * inverse)),
-        )
-        key = pack(i, j, k)
-        s = slot_of(keys, key)
+        at[m, 0], at[m, 1], at[m, 2] = x, y, z
+        i, j, k = np.floor(x * inverse), np.floor(y * inverse), np.floor(z * inverse)
+        of[m] = pack(np.int64(i), np.int64(j), np.int64(k))
+        home = home_of(keys, of[m])
+        prefetch(keys, home)
+        prefetch(value, home)
+
+
+@njit(cache=True, nogil=True)
+def _ask_for_voxels(store, of):  # type: ignore[no-untyped-def]
+    keys, value, _, counts, pool, weights, _ = store
+    per = pool.shape[1]
+    for m in range(of.size):
+        s = slot_of(keys, of[m])
+        v = np.int64(value[s]) if keys[s] != 0 else 0
+        prefetch(counts, v)
+        prefetch(weights, v * per)
+        prefetch(pool, v * per * 3)
+        prefetch(pool, v * per * 3 + per * 3 - 1)
+
+
+@njit(cache=True, nogil=True)
+def _put(store, voxels, at, of, limits):  # type: ignore[no-untyped-def]
+    """Each into the mean of the nearest within the spacing, else a new point of its voxel, if there is room."""
+    (keys, value, pool_keys, counts, pool, weights, _), (_, spacing2, averaged) = store, limits
+    refused = added = 0
+    for m in range(of.size):
+        s = slot_of(keys, of[m])
         if keys[s] == 0:
             if voxels == pool.shape[0]:
                 refused += 1
                 continue
-            keys[s], value[s], pool_keys[voxels] = key, voxels, key
+            keys[s], value[s], pool_keys[voxels] = of[m], voxels, of[m]
             voxels += 1
         v = value[s]
         n = counts[v]
-        nearest, at = spacing2, -1
+        nearest, by = spacing2, -1
         for u in range(n):
-            dx, dy, dz = pool[v, u, 0] - x, pool[v, u, 1] - y, pool[v, u, 2] - z
+            dx, dy, dz = pool[v, u, 0] - at[m, 0], pool[v, u, 1] - at[m, 1], pool[v, u, 2] - at[m, 2]
             d = dx * dx + dy * dy + dz * dz
             if d < nearest:
-                nearest, at = d, u
-        if at >= 0:
-            if weights[v, at] < averaged:
-                weights[v, at] += 1
-                share = 1.0 / weights[v, at]
-                pool[v, at, 0] += share * (x - pool[v, at, 0])
-                pool[v, at, 1] += share * (y - pool[v, at, 1])
-                pool[v, at, 2] += share * (z - pool[v, at, 2])
-        elif n < pool.shape[1]:
-            pool[v, n, 0], pool[v, n, 1], pool[v, n, 2] = x, y, z
+                nearest, by = d, u
+        if by < 0 and n < pool.shape[1]:
+            for i in range(3):
+                pool[v, n, i] = at[m, i]
             weights[v, n], counts[v] = 1, n + 1
             added += 1
+        elif by >= 0 and weights[v, by] < averaged:
+            weights[v, by] += 1
+            share = 1.0 / weights[v, by]
+            for i in range(3):
+                pool[v, by, i] += share * (at[m, i] - pool[v, by, i])
     return voxels, refused, added

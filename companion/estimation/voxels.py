@@ -22,14 +22,20 @@ def pack(i, j, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def slot_of(keys, key):  # type: ignore[no-untyped-def]
-    """Index of `key`, or of the free slot where it belongs. `keys` must not be full."""
-    mask = np.uint64(keys.shape[0] - 1)
+def home_of(keys, key):  # type: ignore[no-untyped-def]
+    """Index at which the search for `key` begins."""
     h = np.uint64(key)
     h ^= h >> np.uint64(31)
     h *= np.uint64(0x9E3779B97F4A7C15)
     h ^= h >> np.uint64(29)
-    s = h & mask
+    return h & np.uint64(keys.shape[0] - 1)
+
+
+@njit(cache=True, nogil=True)
+def slot_of(keys, key):  # type: ignore[no-untyped-def]
+    """Index of `key`, or of the free slot where it belongs. `keys` must not be full."""
+    mask = np.uint64(keys.shape[0] - 1)
+    s = home_of(keys, key)
     while keys[s] != key and keys[s] != 0:
         s = (s + np.uint64(1)) & mask
     return s

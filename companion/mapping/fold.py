@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from companion.core.prefetch import prefetch
 from companion.mapping.cell_word import CELLS_PER_WORD, update_word
 from companion.mapping.marks import PASSES, PROVEN, mark
-from companion.mapping.prefetch import prefetch
 from companion.mapping.rays import WORDS
 
 _AHEAD = 8  # blocks
