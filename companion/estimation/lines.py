@@ -73,15 +73,10 @@ def find_lines(
 
 @njit(cache=True, nogil=True)
 def _find_lines(store, points, R, p, limits, lines, valid):  # type: ignore[no-untyped-def]
-    near2, near = np.empty(5), np.empty((5, 3))
-    x, line = np.empty(3), np.empty(6)
-    used = 0
+    near, line, used = np.empty((points.shape[0], 5, 3)), np.empty(6), 0
+    nearest_five(store, points, R, p, limits, near, valid)
     for q in range(points.shape[0]):
-        for i in range(3):
-            x[i] = R[i, 0] * points[q, 0] + R[i, 1] * points[q, 1] + R[i, 2] * points[q, 2] + p[i]
-        for u in range(5):
-            near2[u] = limits[1]
-        valid[q] = nearest_five(store, x, limits[0], near2, near) and _fit_line(near, limits[2], limits[3], line)
+        valid[q] = valid[q] and _fit_line(near[q], limits[2], limits[3], line)
         if valid[q]:
             lines[q] = line
             used += 1

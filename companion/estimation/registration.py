@@ -79,15 +79,10 @@ def find_planes(
 
 @njit(cache=True, nogil=True)
 def _find_planes(store, points, R, p, limits, planes, valid):  # type: ignore[no-untyped-def]
-    near2, near = np.empty(5), np.empty((5, 3))
-    x, plane = np.empty(3), np.empty(4)
-    used = 0
+    near, plane, used = np.empty((points.shape[0], 5, 3)), np.empty(4), 0
+    nearest_five(store, points, R, p, limits, near, valid)
     for q in range(points.shape[0]):
-        for i in range(3):
-            x[i] = R[i, 0] * points[q, 0] + R[i, 1] * points[q, 1] + R[i, 2] * points[q, 2] + p[i]
-        for u in range(5):
-            near2[u] = limits[1]
-        valid[q] = nearest_five(store, x, limits[0], near2, near) and _fit_plane(near, limits[2], limits[3], plane)
+        valid[q] = valid[q] and _fit_plane(near[q], limits[2], limits[3], plane)
         if valid[q]:
             for i in range(4):
                 planes[q, i] = plane[i]
@@ -108,47 +103,54 @@ _ORDER = _nearest_first()
 
 
 @njit(cache=True, nogil=True)
-def nearest_five(store, x, voxel_m, near2, near):  # type: ignore[no-untyped-def]
-    """The 27 voxels around x, nearer ones first, skipping those that cannot hold a nearer point."""
-    keys, value, counts, pool = store
-    i0, j0, k0 = (
-        np.int64(np.floor(x[0] / voxel_m)),
-        np.int64(np.floor(x[1] / voxel_m)),
-        np.int64(np.floor(x[2] / voxel_m)),
-    )
-    gx, gy, gz = x[0] - i0 * voxel_m, x[1] - j0 * voxel_m, x[2] - k0 * voxel_m
-    si = -1 if 2.0 * gx < voxel_m else 1  # the nearer side
-    sj = -1 if 2.0 * gy < voxel_m else 1
-    sk = -1 if 2.0 * gz < voxel_m else 1
-    found = 0
-    for o in range(27):
-        a, b, c = _ORDER[o, 0], _ORDER[o, 1], _ORDER[o, 2]
-        di = 0 if a == 0 else (si if a == 1 else -si)
-        dj = 0 if b == 0 else (sj if b == 1 else -sj)
-        dk = 0 if c == 0 else (sk if c == 1 else -sk)
-        ex = 0.0 if di == 0 else (gx if di < 0 else voxel_m - gx)
-        ey = 0.0 if dj == 0 else (gy if dj < 0 else voxel_m - gy)
-        ez = 0.0 if dk == 0 else (gz if dk < 0 else voxel_m - gz)
-        if ex * ex + ey * ey + ez * ez >= near2[4]:
-            continue
-        s = slot_of(keys, pack(i0 + di, j0 + dj, k0 + dk))
-        if keys[s] == 0:
-            continue
-        v = value[s]
-        for u in range(counts[v]):
-            dx, dy, dz = pool[v, u, 0] - x[0], pool[v, u, 1] - x[1], pool[v, u, 2] - x[2]
-            d = dx * dx + dy * dy + dz * dz
-            if d >= near2[4]:
+def nearest_five(store, points, R, p, limits, near, valid):  # type: ignore[no-untyped-def]
+    """The five map points nearest to each R @ point + p, into `near` (N, 5, 3); `valid` (N,): there are so many.
+
+    `limits` begin with the edge of a voxel and the square of how far they may be. Of the 27 voxels around a point
+    nearer ones come first, and those that cannot hold a nearer point are skipped.
+    """
+    (keys, value, counts, pool), voxel_m, near2 = store, limits[0], np.empty(5)
+    for q in range(points.shape[0]):
+        a, b, c = points[q, 0], points[q, 1], points[q, 2]
+        x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0]
+        y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + p[1]
+        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + p[2]
+        i0, j0, k0 = np.int64(np.floor(x / voxel_m)), np.int64(np.floor(y / voxel_m)), np.int64(np.floor(z / voxel_m))
+        gx, gy, gz = x - i0 * voxel_m, y - j0 * voxel_m, z - k0 * voxel_m
+        si = -1 if 2.0 * gx < voxel_m else 1  # the nearer side
+        sj = -1 if 2.0 * gy < voxel_m else 1
+        sk = -1 if 2.0 * gz < voxel_m else 1
+        found = 0
+        near2[:] = limits[1]
+        for o in range(27):
+            a, b, c = _ORDER[o, 0], _ORDER[o, 1], _ORDER[o, 2]
+            di = 0 if a == 0 else (si if a == 1 else -si)
+            dj = 0 if b == 0 else (sj if b == 1 else -sj)
+            dk = 0 if c == 0 else (sk if c == 1 else -sk)
+            ex = 0.0 if di == 0 else (gx if di < 0 else voxel_m - gx)
+            ey = 0.0 if dj == 0 else (gy if dj < 0 else voxel_m - gy)
+            ez = 0.0 if dk == 0 else (gz if dk < 0 else voxel_m - gz)
+            if ex * ex + ey * ey + ez * ez >= near2[4]:
                 continue
-            w = 4
-            while w > 0 and near2[w - 1] > d:
-                near2[w] = near2[w - 1]
-                near[w, 0], near[w, 1], near[w, 2] = near[w - 1, 0], near[w - 1, 1], near[w - 1, 2]
-                w -= 1
-            near2[w] = d
-            near[w, 0], near[w, 1], near[w, 2] = pool[v, u, 0], pool[v, u, 1], pool[v, u, 2]
-            found += 1
-    return found >= 5
+            s = slot_of(keys, pack(i0 + di, j0 + dj, k0 + dk))
+            if keys[s] == 0:
+                continue
+            v = value[s]
+            for u in range(counts[v]):
+                dx, dy, dz = pool[v, u, 0] - x, pool[v, u, 1] - y, pool[v, u, 2] - z
+                d = dx * dx + dy * dy + dz * dz
+                if d >= near2[4]:
+                    continue
+                w = 4
+                while w > 0 and near2[w - 1] > d:
+                    near2[w] = near2[w - 1]
+                    for i in range(3):
+                        near[q, w, i] = near[q, w - 1, i]
+                    w -= 1
+                near2[w] = d
+                near[q, w, 0], near[q, w, 1], near[q, w, 2] = pool[v, u, 0], pool[v, u, 1], pool[v, u, 2]
+                found += 1
+        valid[q] = found >= 5
 
 
 @njit(cache=True, nogil=True)
