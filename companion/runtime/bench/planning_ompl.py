@@ -93,6 +93,7 @@ class _Problem:
         self.information.setMotionValidator(self._motions)
         self.information.setup()
         self.definition = base.ProblemDefinition(self.information)
+        self._least = float(np.linalg.norm(goal - start))
         ends = [states.allocState(), states.allocState()]
         for axis in range(3):
             ends[0][axis], ends[1][axis] = float(start[axis]), float(goal[axis])
@@ -122,8 +123,7 @@ class _Problem:
             started = time.process_time()
             geometric.PathSimplifier(self.information).simplifyMax(path)
             spent += time.process_time() - started
-            if path.length() * self._space.resolution_m < trace[-1][1]:
-                trace.append((spent, path.length() * self._space.resolution_m))
+            self._add(trace, spent, path.length())
         return trace
 
     def _planner(self, name: str) -> Any:
@@ -142,8 +142,12 @@ class _Problem:
     def _note(self, trace: Trace, spent: float) -> None:
         if not self.definition.hasExactSolution():
             return
-        length = self.definition.getSolutionPath().length() * self._space.resolution_m
-        if not trace or length < trace[-1][1] - 1e-9:
+        self._add(trace, spent, self.definition.getSolutionPath().length())
+
+    def _add(self, trace: Trace, spent: float, cells: float) -> None:
+        """A way that is the shortest yet. Once in some thousand runs OMPL has one of no length: that is none."""
+        length = cells * self._space.resolution_m
+        if cells > self._least - 1e-6 and (not trace or length < trace[-1][1] - 1e-9):
             trace.append((spent, length))
 
 
