@@ -233,6 +233,19 @@ def test_points_of_the_map_become_the_mean_of_what_was_seen_there():
     assert rms[30] == pytest.approx(0.02 * (3 / 30) ** 0.5, rel=0.15)
 
 
+@pytest.mark.parametrize("config", [PointMapConfig(averaged=20), PointMapConfig(max_voxels=40)])
+def test_points_at_once_are_points_one_after_another(config):
+    """Some share a voxel that is new with the first of them, some a spacing; in the second map not all have room."""
+    points = np.random.default_rng(9).normal(0, 1.5, (700, 3)).astype(np.float32)
+    at_once, one_by_one = PointMap(config), PointMap(config)
+    at_once.insert(points, np.eye(3), np.zeros(3))
+    for n in range(len(points)):
+        one_by_one.insert(points[n : n + 1], np.eye(3), np.zeros(3))
+    assert at_once.points().tobytes() == one_by_one.points().tobytes()
+    assert (at_once.voxels, at_once.refused) == (one_by_one.voxels, one_by_one.refused)
+    assert at_once.voxels >= 40
+
+
 def test_a_full_map_refuses_and_never_hangs():
     rng = np.random.default_rng(6)
     target = PointMap(PointMapConfig(max_voxels=500))
