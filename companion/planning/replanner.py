@@ -166,7 +166,7 @@ class Replanner:
         self._goal_odom = at_height(goal.p_odom, goal.agl_m, now.local_map, within_m=within, fallback_z=now.ground_z)
         spaces = self._finder.spaces(now.local_map, now.ground, goal.limits)
         rng = np.random.default_rng([self._seed, self._replans])
-        if self.reached and self._good(kept, spaces.widest):
+        if self.reached and not self._substitute and self._good(kept, spaces.widest):
             return self._flown_along(kept, kept.rest, spaces.widest)
         route = self._find(spaces, kept, goal, rng)
         self._proofs = self._proofs + 1 if route is None and self._finder.proven else 0

@@ -77,6 +77,20 @@ def test_it_steps_aside_and_comes_back(flights, local_map, speed):
     assert np.linalg.norm(flight.vehicle.v) < 0.1
 
 
+def test_who_has_reached_a_place_in_the_stead_of_the_goal_goes_on_to_it_when_it_is_free(flights, local_map):
+    occupied = hall()
+    occupied[29:32, 29:32] = True
+    flight = flights.Flight(local_map, occupied, HELD - [4.0, 0, 0], known=np.ones_like(occupied), gust=0.0)
+    flight.send(flights.goal_at(HELD, blocked="nearest_free"))
+    flight.run(8.0)
+    assert flight.status.state == "reached"
+    assert 0.8 < np.linalg.norm(flight.vehicle.p - HELD) < 2.0
+    flight.eyes.occupied[29:32, 29:32, 1:] = False  # it was somebody who stood there
+    flight.run(5.0)
+    assert np.linalg.norm(flight.vehicle.p - HELD) < 0.3
+    assert flight.status.state == "reached"
+
+
 def test_it_stays_where_nothing_comes_near(flights, local_map):
     flight, gaps = hold_among(flights, local_map, [HELD[0] - 4.0, 8.5, 1.4], [1.0, 0.0, 0.0], 8.0)
     assert gaps.min() < 2.0
