@@ -266,8 +266,8 @@ def _memory(voxels: VoxelMap) -> Memory:
 
 
 def _rows(vectors: Array32) -> Array32:
-    """(N, 3), contiguous, and a copy if it is read-only, which would be one more type to compile for."""
-    array = np.require(vectors, np.float32, ["C", "W"])
+    """(N, 3), contiguous; a copy if it is read-only or not aligned, which would be one more type to compile for."""
+    array = np.require(vectors, np.float32, ["C", "W", "A"])
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"shape {array.shape} is no list of vectors", field="points", valid="(N, 3)")
     return array

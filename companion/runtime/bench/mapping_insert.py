@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from companion.core.messages import Array
 from companion.mapping.voxel_map import VoxelMap, VoxelMapConfig
-from companion.runtime.bench.mapping_peers import OCTOMAP_MODEL, Insertion, OctoMap, Prototype, RayPer, settled_cpu_ms
+from companion.runtime.bench.mapping_peers import OCTOMAP_MODEL, Insertion, OctoMap, Prototype, RayPer, cpu_ms
 from companion.runtime.bench.mapping_scans import Scan
 
 RANGE_M = 30.0
@@ -46,7 +46,7 @@ def time_insertion(
         insertions += [] if prototype is None else [prototype.empty(resolution_m, RANGE_M)]
         for k, scan in enumerate(scans):
             works = [insertion(scan) for insertion in insertions]
-            taken[:, k] = np.minimum(taken[:, k], [settled_cpu_ms(work) for work in works])
+            taken[:, k] = np.minimum(taken[:, k], [cpu_ms(work) for work in works])
     later = taken[:, 1:].mean(axis=1)
     figures = {
         "ours_ms": float(later[0]),

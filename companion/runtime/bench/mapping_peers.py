@@ -78,21 +78,16 @@ class Prototype:
 
 
 def cpu_ms(work: Callable[[], object]) -> float:
-    """CPU time of one call in this process, ms."""
-    started = time.process_time_ns()
-    work()
-    return (time.process_time_ns() - started) * 1e-6
-
-
-def settled_cpu_ms(work: Callable[[], object]) -> float:
-    """`cpu_ms` of work that finds the allocator tidy.
+    """CPU time of one call in this process, ms; the allocator is tidy when it begins.
 
     OctoMap frees a million small pieces per scan, which glibc sorts when others ask for memory, 10,000 at each
     request: up to 15 ms of OctoMap's that the next in turn would be charged with.
     """
     for _ in range(_REQUESTS):
         np.empty(_REQUEST_BYTES, np.uint8)
-    return cpu_ms(work)
+    started = time.process_time_ns()
+    work()
+    return (time.process_time_ns() - started) * 1e-6
 
 
 def alternate(works: dict[str, Callable[[], object]], *, rounds: int) -> dict[str, float]:
