@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from companion.core.messages import Array
-from companion.estimation.normal import LEVER, Normal
+from companion.estimation.normal import LEVER, Normal, turned
 from companion.estimation.state import ERROR
 
 _CLEAR = 3.0  # times `below`: of such an axis 99 % would be kept, and nothing is left out
@@ -44,8 +44,8 @@ class BlindAxes:
         self._last, below = normal, self.config.below
         if normal.scale <= 0 or below <= 0 or normal.weakest > _CLEAR * below:
             return normal
-        values, vectors = np.linalg.eigh(_in_levers(normal) if self._mean is None else self._mean)
-        axes = _turn(normal.R).T @ vectors
+        values, vectors = np.linalg.eigh(normal.in_odom / normal.scale if self._mean is None else self._mean)
+        axes = turned(normal.R).T @ vectors
         kept = values**4 / (values**4 + below**4)
         spread = ((axes.T @ _BACK @ P @ _BACK @ axes).diagonal() * (kept < 0.5)).sum()
         kept /= 1.0 + np.maximum(values, 0.0) * normal.scale * self.config.lean**2 * spread
@@ -69,7 +69,7 @@ class BlindAxes:
         if last.weakest > _CLEAR * c.below:
             self._mean = None
             return
-        own = _in_levers(last)
+        own = last.in_odom / last.scale
         self._mean = own if self._mean is None else self._mean + c.renewed * (own - self._mean)
 
 
@@ -104,15 +104,3 @@ class BlindDrift:
         """Nothing is left of it."""
         self.C[:] = 0.0
 
-
-def _in_levers(normal: Normal) -> Array:
-    """Its scaled information (6, 6) on turn and shift in odom."""
-    turn = _turn(normal.R)
-    return np.asarray(turn @ LEVER @ normal.H @ LEVER @ turn.T / normal.scale)
-
-
-def _turn(R: Array) -> Array:
-    """Of a turn in the body and a shift in odom, (6, 6), to both in odom."""
-    turn = np.eye(6)
-    turn[:3, :3] = R
-    return turn

@@ -129,7 +129,7 @@ class Lio:
         spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
         if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):
             if not self._silent:  # nobody knows how the vehicle turned meanwhile, so the sweep is smeared
-                self._extend(spaced, edges_body)
+                self._extend(spaced, edges_body, normal)
             self._scan_s, self._back_s = self.filter.t_s, None
             if normal is not None:
                 self._watch.took(normal)
@@ -261,7 +261,7 @@ class Lio:
             self.filter.P = self.filter.P + self._drift.covariance
             self._drift.reset()
 
-    def _extend(self, spaced: Array32, edges_body: Array) -> None:
+    def _extend(self, spaced: Array32, edges_body: Array, normal: Normal | None) -> None:
         state = self.filter.state
         seen = (spaced, edges_body, state.R.copy(), state.p.copy())
         settled = self._standing.settled(self.filter.t_s, seen) if self.map.voxels else seen
@@ -270,9 +270,13 @@ class Lio:
         spaced, edges_body, R, p = settled
         if self._edges is not None:
             self._edges.insert(edges_body, R, p)
+        voxels = self.map.voxels
         share = self.map.insert(spaced, R, p) / max(len(spaced), 1)
         self._map_error.move(state.p)
         self._map_error.extend(state, self.filter.P, share * self.config.map_error.share)
+        if self._standing.is_over and normal is not None and normal.used >= self.config.min_planes:
+            met = len(self._thinner.firsts(spaced, self.config.map.voxel_m))
+            self._map_error.lean(normal, (self.map.voxels - voxels) / max(met, 1), self.config.map_error.lean)
 
     def _is_known(self, normal: Normal) -> bool:
         """Whether the map should have explained the scan; a nearly empty one cannot."""

@@ -1,9 +1,16 @@
 """What the filter cannot know: how far its own map has drifted.
 
 The filter measures against a map that it takes as true. What a sweep adds to the map carries the error of that
-sweep's pose, and later sweeps are matched against it: yaw and position do a random walk whose step is the error of
-one pose, taken in the share in which the map is new. Tilt does not: gravity is measured. Yaw and position walk
-together, since the way ahead is laid along the yaw that there is.
+sweep's pose, and later sweeps are matched against it: the map does a random walk.
+
+Yaw and position walk by the error of a pose, taken in the share in which the map is new. They walk together, since
+the way ahead is laid along the yaw that there is.
+
+Roll, pitch and height walk by what a single sweep tells of them, not by what the filter believes: that is the mean of
+many sweeps against a map that they all take as true, and beside it gravity has no say. Noise n of a sweep's tilt,
+covariance N, of which the filter takes K n and forgets K of what it has, turns the map by s K n (1 + (1 - K) + ...)
+= s n, with s the share of the room in sight that is new. So each sweep adds s^2 N. A LiDAR that sees far tells the
+tilt well and needs the new ground little; one that sees 8 m of a plain has only a strip of it, and the map bends.
 
 Source: the consider state of Schmidt ("Application of state-space methods to navigation problems", 1966): it widens
 what is said, and corrects nothing.
@@ -18,7 +25,13 @@ import numpy as np
 
 from companion.core.geometry import skew
 from companion.core.messages import Array
+from companion.estimation.normal import LEVER, Normal
 from companion.estimation.state import ERROR, State
+
+_LEANS = np.ix_([0, 1, 5], [0, 1, 5])  # roll, pitch and height of turn and shift in odom
+_LEVERS = LEVER[_LEANS]
+_SEEN = 0.003  # normalised eigenvalue below which sweeps do not lay the map by it: the camera or the IMU does
+_RENEWED = 0.1  # of the mean over sweeps, by each
 
 
 class MapErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -28,37 +41,50 @@ class MapErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         0.1  # of a pose's covariance, per map renewed: errors of sweeps average out
     )
     track_share: Annotated[float, msgspec.Meta(ge=0)] = 3.0  # the same, of the camera's anchors
+    lean: Annotated[float, msgspec.Meta(ge=0)] = 1.0  # of a sweep's own covariance of tilt and height; 1: as derived
 
 
 class MapError:
-    """Covariance (4, 4) of yaw about the vertical (rad) and position in odom (m) of the map at the vehicle."""
+    """Covariance (6, 6) of turn (rad) and position (m), both in odom, of the map at the vehicle."""
 
     def __init__(self) -> None:
-        self.C = np.zeros((4, 4))
+        self.C = np.zeros((6, 6))
         self._p: Array | None = None
+        self._told: Array | None = None  # what a sweep tells, in the mean: turn and shift in odom, in levers
 
     def move(self, p: Array) -> None:
-        """The vehicle went to p (3,): what was yaw becomes position across the way."""
+        """The vehicle went to p (3,): what was a turn becomes position across the way."""
         if self._p is not None:
-            x, y, _ = p - self._p
-            A = np.eye(4)
-            A[1, 0], A[2, 0] = -y, x
+            A = np.eye(6)
+            A[3:, :3] = -skew(p - self._p)
             self.C = A @ self.C @ A.T
         self._p = p.copy()
 
     def extend(self, state: State, P: Array, share: float) -> None:
-        """`share` of what was seen is new to the map and got the error of the pose, P (18, 18)."""
-        J = np.zeros((4, 6))
-        J[0, :3] = state.R[2]  # yaw is the turn about odom's vertical
-        J[1:, 3:] = np.eye(3)
+        """`share` of what was seen is new to the map and got yaw and position of the pose, P (18, 18)."""
+        J = np.zeros((6, 6))
+        J[2, :3] = state.R[2]  # yaw is the turn about odom's vertical
+        J[3:, 3:] = np.eye(3)
         self.C = self.C + share * J @ P[:6, :6] @ J.T
 
+    def lean(self, swept: Normal, share: float, factor: float) -> None:
+        """`share` of the room that a sweep met is new to the map, and leans by what one sweep tells: (s^2 N) `factor`.
+
+        N is taken from the mean information of sweeps, as a filter's gain is, with yaw and the way given.
+        """
+        own = swept.in_odom
+        self._told = own if self._told is None else self._told + _RENEWED * (own - self._told)
+        scale = float(np.trace(self._told[3:, 3:]))
+        values, axes = np.linalg.eigh(self._told[_LEANS] / scale)
+        variances = factor * share**2 / scale * values**3 / (values**4 + _SEEN**4)
+        self.C[_LEANS] += _LEVERS @ (axes * variances) @ axes.T @ _LEVERS
+
     def covariance(self, state: State) -> Array:
-        """Its part of the error state's covariance, (18, 18): also the velocity turns with the yaw."""
-        J = np.zeros((ERROR, 4))
-        J[:3, 0] = state.R[2]
-        J[3:6, 1:] = np.eye(3)
-        J[6:9, 0] = skew(np.array([0.0, 0.0, 1.0])) @ state.v
+        """Its part of the error state's covariance, (18, 18): also the velocity turns with the map."""
+        J = np.zeros((ERROR, 6))
+        J[:3, :3] = state.R.T
+        J[3:6, 3:] = np.eye(3)
+        J[6:9, :3] = -skew(state.v)
         return J @ self.C @ J.T
 
     def reset(self) -> None:

@@ -32,12 +32,25 @@ class Normal:
         """Sum of the information on position, 1/m2: eigenvalues are compared with it."""
         return float(np.trace(self.H[3:, 3:]))
 
+    @property
+    def in_odom(self) -> Array:
+        """Information (6, 6) on turn and shift in odom, in levers, 1/m2."""
+        turn = turned(self.R)
+        return np.asarray(turn @ LEVER @ self.H @ LEVER @ turn.T)
+
     def weak_axes(self, below: float) -> list[str]:
         """Names of the directions in which it says hardly anything, in odom: an axis, or a turn about one."""
         if self.scale <= 0:
             return ["every axis"]
         values, vectors = np.linalg.eigh(LEVER @ self.H @ LEVER / self.scale)
         return [_named(v, self.R) for v in vectors[:, values < below].T]
+
+
+def turned(R: Array) -> Array:
+    """Of a turn in the body and a shift in odom, (6, 6), to both in odom."""
+    turn = np.eye(6)
+    turn[:3, :3] = R
+    return turn
 
 
 def _named(direction: Array, R: Array) -> str:
