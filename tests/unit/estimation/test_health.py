@@ -56,7 +56,8 @@ def test_map_error_is_the_covariance_of_a_drifting_map():
         shift += rng.normal(0, 1, (4000, 3)) * np.sqrt(0.5 * np.diag(P)[3:6])
         before = p
     sample = np.cov(np.column_stack([yaw, shift]).T)
-    np.testing.assert_allclose(model.C, sample, rtol=0.12, atol=0.05 * sample.max())
+    assert not model.C[:2].any()  # roll and pitch are another matter
+    np.testing.assert_allclose(model.C[2:, 2:], sample, rtol=0.12, atol=0.05 * sample.max())
     assert np.linalg.eigvalsh(model.covariance(state))[0] > -1e-12
 
 
