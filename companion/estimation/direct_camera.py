@@ -22,7 +22,7 @@ from companion.estimation.ground_rays import GroundRays
 from companion.estimation.image_gate import ImageGate
 from companion.estimation.normal import Normal
 from companion.estimation.patches import cut, no_patches, pyramid
-from companion.estimation.photometric import FOUND, MISSED, SHARED, linearise
+from companion.estimation.photometric import FOUND, MISSED, SHARED, eliminate, linearise
 from companion.estimation.point_map import PointMap
 from companion.estimation.registration import PlaneConfig
 
@@ -37,6 +37,7 @@ class DirectCamera:
     def __init__(self, config: CameraConfig, rig: Rig, lidar_hold: Callable[[], float]) -> None:
         self.config, self._direct, self._lidar_hold = config, config.direct, lidar_hold
         self._inflation = config.direct.inflation
+        self._sigma_ground = np.array([config.direct.sigma_height_m, *2 * [config.direct.sigma_slope]])
         self._mount = (np.ascontiguousarray(rig.camera.R_body_sensor), rig.camera.p_body)
         self._intrinsics = np.array([rig.pinhole.focal_px, *rig.pinhole.center_px])
         self._ground = GroundRays(rig, depth_m=(config.min_depth_m, config.max_depth_m))
@@ -128,14 +129,8 @@ class DirectCamera:
         trust = (grey, c.sigma_depth_m**2, floor, c.cauchy, gate)
         view = (images[level], *pose, self._mount, self._intrinsics)
         used = linearise(self._patches.arrays, level, view, trust, H, g, fate)
-        ground = np.array([c.sigma_height_m, c.sigma_slope, c.sigma_slope])
-        return Normal(
-            pose[0].copy(),
-            pose[1].copy(),
-            *_marginal(H / self._inflation, g / self._inflation, ground),
-            used,
-            len(fate),
-        )
+        H, g = _marginal(H / self._inflation, g / self._inflation, self._sigma_ground)
+        return Normal(pose[0].copy(), pose[1].copy(), H, g, used, len(fate))
 
     def _refill(
         self, pixels: Bytes2D, images: list[Array32], filter_: Filter, target: PointMap, planes: PlaneConfig
@@ -180,6 +175,6 @@ class DirectCamera:
 
 
 def _marginal(H: Array, g: Array, sigmas: Array) -> tuple[Array, Array]:
-    """Normal equations of the first six unknowns, the others known to `sigmas` about zero (Schur)."""
-    across = np.linalg.solve(H[6:, 6:] + np.diag(sigmas**-2.0), H[6:, :6]).T
-    return H[:6, :6] - across @ H[6:, :6], g[:6] - across @ g[6:]
+    """Normal equations of the first six unknowns, the others known to `sigmas` about zero; H and g are used up."""
+    eliminate(H, g, sigmas)
+    return H[:6, :6], g[:6]

@@ -44,7 +44,7 @@ class Patches:
     @property
     def arrays(self) -> tuple[Array, ...]:
         """All but `misses`, for kernels."""
-        return tuple(getattr(self, f.name) for f in fields(self)[:-1])
+        return self.centres, self.tangents, self.rays, self.pictures, self.energy, self.slopes, self.inverse
 
     def only(self, which: Flags) -> Patches:
         """Those of a mask (N,)."""
