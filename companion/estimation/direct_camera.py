@@ -175,6 +175,7 @@ class DirectCamera:
 
 
 def _marginal(H: Array, g: Array, sigmas: Array) -> tuple[Array, Array]:
-    """Normal equations of the first six unknowns, the others known to `sigmas` about zero; H and g are used up."""
+    """Normal equations of the first six unknowns, the others known to `sigmas` about zero (Schur)."""
+    H, g = H.copy(), g.copy()
     eliminate(H, g, sigmas)
     return H[:6, :6], g[:6]
