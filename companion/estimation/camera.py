@@ -36,7 +36,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Tracking and the trust in it."""
 
     enabled: bool = True
-    method: Literal["tracks", "direct"] = "tracks"  # corners followed, or patches aligned by their grey levels
+    method: Literal["tracks", "direct"] = "direct"  # corners followed, or patches aligned by their grey levels
     direct: DirectConfig = DirectConfig()
     image: ImageGateConfig = ImageGateConfig()
     tracks: Count = 120  # at most
