@@ -23,6 +23,7 @@ from companion.estimation.image_gate import ImageGate, ImageGateConfig
 from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap
 from companion.estimation.registration import Flags, PlaneConfig
+from companion.estimation.state import State
 
 cv2.setNumThreads(1)  # same bits every time, and the other cores are not ours
 
@@ -87,6 +88,10 @@ class CameraTracker:
             self._refill(pixels, filter_, target, planes)
         used = normal is not None and normal.used >= self.config.min_tracks
         return normal if used else None
+
+    def above_m(self, state: State) -> float:
+        """Height above the ground in view."""
+        return self._ground.above_m(state)
 
     def forget(self) -> None:
         """Drop all tracks: the next image begins new ones."""

@@ -25,6 +25,7 @@ from companion.estimation.patches import cut, no_patches, pyramid
 from companion.estimation.photometric import FOUND, MISSED, SHARED, eliminate, linearise
 from companion.estimation.point_map import PointMap
 from companion.estimation.registration import PlaneConfig
+from companion.estimation.state import State
 
 
 class DirectCamera:
@@ -65,6 +66,10 @@ class DirectCamera:
         if len(self._patches) < self._direct.refill_below:
             self._refill(pixels, images, filter_, target, planes)
         return normal if normal is not None and normal.used >= least else None
+
+    def above_m(self, state: State) -> float:
+        """Height above the ground in view."""
+        return self._ground.above_m(state)
 
     def forget(self) -> None:
         """Drop all patches: the next image begins new ones."""

@@ -24,6 +24,10 @@ class GroundRays:
         self._nearest_m, self._farthest_m = depth_m
         self._ground_m = 0.0  # in odom
 
+    def above_m(self, state: State) -> float:
+        """How high the camera is above the ground that it usually sees; never nearer than it could see any."""
+        return max(float(state.p[2] + state.R[2] @ self._p) - self._ground_m, self._nearest_m)
+
     def rays(self, corners: Array32, state: State) -> tuple[Array, Array]:
         """OpenCV pixels (N, 2) to the camera's position in odom (3,) and rays in odom (N, 3), 1 along the axis."""
         R, p = state.R, state.p

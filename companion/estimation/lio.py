@@ -159,11 +159,16 @@ class Lio:
         normal = self._tracker.update(pixels, self.filter, self.map, self.config.plane)
         self._course.moved(before)
         self._image_s = self._image_s if normal is None else self.filter.t_s
-        if self.filter.t_s - self._scan_s > self.config.lidar_out_s or self._blind.shift is not None:
-            self._track_error.move(self.filter.state.p)
-            share = self._tracker.renewed * self.config.map_error.track_share
-            self._track_error.extend(self.filter.state, self.filter.P, share)
+        self._drift_of_anchors()
         return normal
+
+    def _drift_of_anchors(self) -> None:
+        """While sweeps are out, or blind along the way: then they still hold tilt and height over the ground."""
+        out, state = self.filter.t_s - self._scan_s > self.config.lidar_out_s, self.filter.state
+        if out or self._blind.shift is not None:
+            self._track_error.move(state.p, self._tracker.above_m(state) if out else np.inf)
+            share = self._tracker.renewed * self.config.map_error.track_share
+            self._track_error.extend(state, self.filter.P, share, tilts=out)
 
     def _camera_of(self, config: CameraConfig, rig: Rig) -> CameraTracker | DirectCamera:
         return DirectCamera(config, rig, self._hold) if config.method == "direct" else CameraTracker(config, rig)

@@ -52,18 +52,24 @@ class MapError:
         self._p: Array | None = None
         self._told: Array | None = None  # what a sweep tells, in the mean: turn and shift in odom, in levers
 
-    def move(self, p: Array) -> None:
-        """The vehicle went to p (3,): what was a turn becomes position across the way."""
+    def move(self, p: Array, above_m: float = np.inf) -> None:
+        """The vehicle went to p (3,): what was a turn becomes position across the way.
+
+        `above_m`: how high above what a camera measured the way against; as much as that height is wrong, the way is.
+        """
         if self._p is not None:
             A = np.eye(6)
             A[3:, :3] = -skew(p - self._p)
+            A[3:5, 5] = (p - self._p)[:2] / above_m
             self.C = A @ self.C @ A.T
         self._p = p.copy()
 
-    def extend(self, state: State, P: Array, share: float) -> None:
-        """`share` of what was seen is new to the map and got yaw and position of the pose, P (18, 18)."""
+    def extend(self, state: State, P: Array, share: float, *, tilts: bool = False) -> None:
+        """`share` of what was seen is new to the map and got yaw and position of the pose, P (18, 18); `tilts`: all."""
         J = np.zeros((6, 6))
         J[2, :3] = state.R[2]  # yaw is the turn about odom's vertical
+        if tilts:
+            J[:2, :3] = state.R[:2]
         J[3:, 3:] = np.eye(3)
         self.C = self.C + share * J @ P[:6, :6] @ J.T
 
