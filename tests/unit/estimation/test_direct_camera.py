@@ -246,6 +246,13 @@ def test_the_ground_as_a_whole_is_marginalised():
     np.testing.assert_allclose(np.linalg.solve(marginal, gradient), np.linalg.solve(joint, g)[:6], atol=1e-9)
 
 
+def test_it_knows_how_high_it_is_above_the_ground(ground, plain):
+    state = filter_at(FIRST).state
+    state.p[2] += 0.2
+    height = state.p[2] + (state.R @ MOUNT[1])[2]
+    assert begun(ground, plain).above_m(state) == pytest.approx(height, abs=0.01)
+
+
 def test_it_yields_to_a_lidar_that_holds_every_axis(ground, plain):
     """Twice the inflation where a sweep's smallest eigenvalue is `yield_above`: never less than half is left."""
     hold = [0.0]
