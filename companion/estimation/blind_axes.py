@@ -103,4 +103,3 @@ class BlindDrift:
     def reset(self) -> None:
         """Nothing is left of it."""
         self.C[:] = 0.0
-

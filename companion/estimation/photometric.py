@@ -179,7 +179,7 @@ def linearise(patches, level, view, trust, H, g, fate):  # type: ignore[no-untyp
 
 @njit(cache=True, nogil=True)
 def eliminate(H, g, sigmas):  # type: ignore[no-untyped-def]
-    """Takes what is known to `sigmas` about zero, the last of H (N, N) and g (N,), out of the others, in place (Schur)."""
+    """Takes the last unknowns of H (N, N) and g (N,), known to `sigmas` about zero, out of the others (Schur)."""
     least = H.shape[0] - sigmas.shape[0]
     for k in range(H.shape[0] - 1, least - 1, -1):
         pivot = H[k, k] + 1.0 / (sigmas[k - least] * sigmas[k - least])

@@ -48,7 +48,9 @@ def test_tilt_and_height_lean_by_what_a_sweep_tells_of_them_and_nothing_else_doe
     model = MapError()
     for _ in range(25):
         model.lean(swept(PLAIN), 0.1, 1.0)
-    np.testing.assert_allclose(sigmas(model)[[0, 1, 5]], [0.1 * 5 * s for s in (TILT_RAD, TILT_RAD, HEIGHT_M)], rtol=1e-3)
+    np.testing.assert_allclose(
+        sigmas(model)[[0, 1, 5]], [0.1 * 5 * s for s in (TILT_RAD, TILT_RAD, HEIGHT_M)], rtol=1e-3
+    )
     assert not sigmas(model)[2:5].any()
 
 
