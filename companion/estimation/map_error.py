@@ -9,8 +9,12 @@ the way ahead is laid along the yaw that there is.
 Roll, pitch and height walk by what a single sweep tells of them, not by what the filter believes: that is the mean of
 many sweeps against a map that they all take as true, and beside it gravity has no say. Noise n of a sweep's tilt,
 covariance N, of which the filter takes K n and forgets K of what it has, turns the map by s K n (1 + (1 - K) + ...)
-= s n, with s the share of the room in sight that is new. So each sweep adds s^2 N. A LiDAR that sees far tells the
-tilt well and needs the new ground little; one that sees 8 m of a plain has only a strip of it, and the map bends.
+= s n, with s the share of the room in sight that is new (by less, where K is not well above s). So each sweep adds
+s^2 N. A LiDAR that sees far tells the tilt well and needs the new ground little; one that sees 8 m of a plain has only
+a strip of it, and the map bends.
+
+The anchors that a camera lays while no sweep comes take roll and pitch of the pose, too. And a camera measures its way
+by the height above ground: a height that is off by a hundredth makes the way off by a hundredth.
 
 Source: the consider state of Schmidt ("Application of state-space methods to navigation problems", 1966): it widens
 what is said, and corrects nothing.
