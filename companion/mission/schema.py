@@ -35,6 +35,7 @@ class StepLimits(StrictStruct, frozen=True, kw_only=True):
     speed: Annotated[float, msgspec.Meta(gt=0, le=20, extra={"unit": "m/s"})] | UnsetType = UNSET
     climb: Annotated[float, msgspec.Meta(gt=0, le=10, extra={"unit": "m/s"})] | UnsetType = UNSET
     accel: Annotated[float, msgspec.Meta(gt=0, le=20, extra={"unit": "m/s2"})] | UnsetType = UNSET
+    jerk: Annotated[float, msgspec.Meta(gt=0, le=200, extra={"unit": "m/s3"})] | UnsetType = UNSET
     yaw_rate: Annotated[float, msgspec.Meta(gt=0, le=6.3, extra={"unit": "rad/s"})] | UnsetType = UNSET
     clearance: Annotated[float, msgspec.Meta(ge=0, le=10, extra={"unit": "m"})] | UnsetType = UNSET
     unknown: Literal["blocked", "stop_before", "optimistic"] | UnsetType = UNSET
@@ -170,6 +171,7 @@ class Mission(StrictStruct, frozen=True, kw_only=True):
             speed=set_or(own.speed, set_or(file.speed, 2.0)),
             climb=set_or(own.climb, set_or(file.climb, 1.0)),
             accel=set_or(own.accel, set_or(file.accel, 3.0)),
+            jerk=set_or(own.jerk, set_or(file.jerk, 20.0)),
             yaw_rate=set_or(own.yaw_rate, set_or(file.yaw_rate, 1.5)),
             clearance=set_or(own.clearance, set_or(file.clearance, 0.4)),
             unknown=set_or(own.unknown, set_or(file.unknown, "stop_before")),

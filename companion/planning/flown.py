@@ -8,13 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.core.messages import Array, Limits, LocalMap
+from companion.planning.bends import spacing_of
 from companion.planning.polyline import arc_length, at, cut, length, project, resample, without_repeats
 from companion.planning.space import FieldSpace, distance_in
-from companion.planning.speed_profile import SpeedConfig, known_free_m, spacing_of, speed_profile, strain
+from companion.planning.speed_profile import SpeedConfig, known_free_m, speed_profile, strain
 
 SLOW_M_S = 0.2  # slower than this counts as standing
 _BEHIND_M = 0.5  # kept behind the vehicle, so that it finds itself on the new trajectory
 _SPEED_SLACK_M_S = 0.5  # trust the planned speed unless the vehicle's own differs by more
+_OVERRUN_M = 0.15  # beyond its stop by no more, a vehicle comes back to it
 _ASTRAY_M = 0.8  # farther from its route than this, the vehicle starts anew from where it is
 
 
@@ -56,13 +58,19 @@ class Flown:
         """Planned speed at an arc length."""
         return float(np.interp(s, arc_length(self.points), self.speeds))
 
+    def accel_at(self, s: float) -> float:
+        """Planned acceleration along the way over one spacing from an arc length, m/s2."""
+        step = spacing_of(self.points)
+        squared = np.interp([s, s + step], arc_length(self.points), self.speeds**2)
+        return float(squared[1] - squared[0]) / (2.0 * step) if step > 0.0 else 0.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Commitment:
     """What is flown whatever the new plan says: `head` (M, 3) ends where the plan starts."""
 
     head: Array
-    start_speed: float  # at the head's first point
+    start: tuple[float, float]  # speed m/s and acceleration along the way m/s2 at the head's first point
     rest: Array  # of the old route after the head, (K, 3); empty: none
     rest_reach_m: float  # arc length of the old goal on `rest`
 
@@ -71,8 +79,8 @@ def commit(flown: Flown | None, p_odom: Array, v_odom: Array, *, time_s: float) 
     """Keep what the vehicle flies within `time_s`; one that stands or strayed keeps nothing."""
     speed = float(np.linalg.norm(v_odom))
     if flown is None or len(flown.points) < 2:
-        start = p_odom if flown is None else _near_or(p_odom, flown.points[0])
-        return Commitment(head=start[None], start_speed=speed, rest=np.empty((0, 3)), rest_reach_m=0.0)
+        place = p_odom if flown is None else _near_or(p_odom, flown.points[0])
+        return Commitment(head=place[None], start=(speed, 0.0), rest=np.empty((0, 3)), rest_reach_m=0.0)
     s, off = project(flown.points, p_odom)
     total = length(flown.points)
     end = total if off > _ASTRAY_M else s
@@ -80,13 +88,13 @@ def commit(flown: Flown | None, p_odom: Array, v_odom: Array, *, time_s: float) 
         end = min(s + speed * time_s, total)
         begin = max(s - _BEHIND_M, 0.0)
         planned = flown.speed_at(begin)
-        start_speed = min(max(planned, speed - _SPEED_SLACK_M_S), speed + _SPEED_SLACK_M_S)
+        start = min(max(planned, speed - _SPEED_SLACK_M_S), speed + _SPEED_SLACK_M_S), flown.accel_at(begin)
         head = cut(flown.points, begin, end) if end - begin > 1e-3 else at(flown.points, np.array([end]))
     else:
-        start_speed = 0.0 if speed < SLOW_M_S else speed
+        start = 0.0 if speed < SLOW_M_S else speed, 0.0
         head = p_odom[None] if off > 0.3 else at(flown.points, np.array([s]))
     rest = cut(flown.points, end, total) if total - end > 1e-3 else np.empty((0, 3))
-    return Commitment(head=head, start_speed=start_speed, rest=rest, rest_reach_m=max(flown.reach_m - end, 0.0))
+    return Commitment(head=head, start=start, rest=rest, rest_reach_m=max(flown.reach_m - end, 0.0))
 
 
 def clear_m(points: Array, space: FieldSpace, *, radius_m: float, from_m: float = 0.0) -> float:
@@ -105,7 +113,7 @@ def with_speeds(
     *,
     hull_radius_m: float,
     known_radius_m: float,
-    start_speed: float,
+    start: tuple[float, float],
     reach_m: float,
     stop_m: float = math.inf,
     still_map: LocalMap | None = None,
@@ -126,12 +134,12 @@ def with_speeds(
     if still_map is not None and still_map is not space.map:
         leaving = ~np.logical_or.accumulate(clearance_m >= limits.clearance)
         clearance_m = np.where(leaving, distance_in(still_map, points) - hull_radius_m, clearance_m)
-    speeds = speed_profile(points, limits, config, clearance_m=clearance_m, start_speed=start_speed, stop_m=stop_m)
+    speeds = speed_profile(points, limits, config, clearance_m=clearance_m, start=start, stop_m=stop_m)
     return Flown(points=points, speeds=speeds, reach_m=reach_m, stop_m=stop_m)
 
 
 def braked(flown: Flown, p_odom: Array, v_odom: Array, limits: Limits, config: SpeedConfig, *, stop_m: float) -> Flown:
-    """The same route, stopping at arc length `stop_m` of it, or as soon as it can."""
+    """The same route, stopping at arc length `stop_m` of it, or as soon as it can, whatever the jerk."""
     if len(flown.points) < 2:
         return flown
     s, _ = project(flown.points, p_odom)
@@ -139,13 +147,15 @@ def braked(flown: Flown, p_odom: Array, v_odom: Array, limits: Limits, config: S
     begin = max(s - _BEHIND_M, 0.0)
     points = resample(cut(flown.points, begin, length(flown.points)), config.spacing_m)
     soonest = s + speed**2 / (2.0 * config.along_share * limits.accel)
+    if soonest < flown.stop_m + _OVERRUN_M:  # a gust must not move the place to hold on and on
+        soonest = min(soonest, flown.stop_m)
     stop_m = max(min(stop_m, flown.stop_m), soonest) - begin
     speeds = speed_profile(
         points,
-        limits,
+        replace(limits, jerk=math.inf),
         config,
         clearance_m=np.full(len(points), np.inf),
-        start_speed=max(speed, flown.speed_at(begin)) if speed > SLOW_M_S else 0.0,
+        start=(max(speed, flown.speed_at(begin)) if speed > SLOW_M_S else 0.0, 0.0),
         stop_m=stop_m,
     )
     return replace(flown, points=points, speeds=speeds, reach_m=flown.reach_m - begin, stop_m=stop_m)

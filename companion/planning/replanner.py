@@ -145,7 +145,7 @@ class Replanner:
         low = np.flatnonzero(distance < wished - 0.05)
         stop_m = float(risen[low[0]]) - self.config.speed.stop_margin_m if low.size else math.inf
         self._fails = self._fails + 1 if low.size else 0
-        return self._paced(points, space, goal, start_speed=0.0, reach_m=length(path), stop_m=stop_m)
+        return self._paced(points, space, goal, start=(0.0, 0.0), reach_m=length(path), stop_m=stop_m)
 
     def _hold(self, goal: Goal, now: Situation) -> Flown:
         """Brake on the way, once; then stay, but for what moves: out of its way, and back."""
@@ -267,7 +267,7 @@ class Replanner:
         if length(way) > 1e-3:
             path = smooth(without_repeats(way), space, self.config.smooth, head=head)
         reach_m = length(path) if self._target is None else project(path, self._target)[0]
-        return self._paced(path, space, self.goal, start_speed=kept.start_speed, reach_m=reach_m)
+        return self._paced(path, space, self.goal, start=kept.start, reach_m=reach_m)
 
     def _paced(
         self,
@@ -275,7 +275,7 @@ class Replanner:
         space: FieldSpace,
         goal: Goal,
         *,
-        start_speed: float,
+        start: tuple[float, float],
         reach_m: float,
         stop_m: float = math.inf,
     ) -> Flown:
@@ -286,6 +286,8 @@ class Replanner:
             limits = replace(limits, speed=min(limits.speed, config.creep_speed_m_s))
         if goal.kind == "takeoff":
             limits = replace(limits, unknown="optimistic")
+        if goal.kind == "takeoff" or not math.isnan(goal.yaw):
+            limits = replace(limits, yaw_rate=math.inf)  # the nose does not follow the way
         return with_speeds(
             path,
             space,
@@ -293,7 +295,7 @@ class Replanner:
             config.speed,
             hull_radius_m=self.hull_radius_m,
             known_radius_m=known_m,
-            start_speed=start_speed,
+            start=start,
             reach_m=reach_m,
             stop_m=stop_m,
             still_map=self._still,

@@ -1,4 +1,4 @@
-"""How fast to go where: curvature, nearness, climb, acceleration, and a stop in known-free space."""
+"""How fast to go where: shape of the way, nearness, acceleration, jerk, and a stop in known-free space."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import msgspec
 import numpy as np
 
 from companion.core.messages import Array, Limits, LocalMap
+from companion.planning.bends import by_shape, curvature, spacing_of
 from companion.planning.grid import first_unknown
+from companion.planning.jerk import jerk_limited
 
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-_BEND_POINTS = 3  # curvature is taken over so many points to each side
+_HARSHER = (1.0, 2.0, 4.0, 8.0)  # times the jerk limit, for a start from which nothing less can be met
 
 
 class SpeedConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -25,6 +27,10 @@ class SpeedConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Share of the acceleration limit for speeding up and slowing down."""
     lateral_share: Share = 0.6
     """Share of the acceleration limit for curves."""
+    along_jerk_share: Share = 0.7
+    """Share of the jerk limit for changing the acceleration along the way."""
+    across_jerk_share: Share = 0.6
+    """Share of the jerk limit for going into bends and out of them."""
     near_speed_m_s: Positive = 0.6
     """Speed with the hull touching the map margin ..."""
     near_gain_per_s: Positive = 4.0
@@ -61,34 +67,39 @@ def speed_profile(
     config: SpeedConfig,
     *,
     clearance_m: Array,
-    start_speed: float,
+    start: tuple[float, float],
     stop_m: float = math.inf,
 ) -> Array:
     """Speeds (N,) m/s at evenly spaced `points` (N, 3); the last is 0.
 
-    `clearance_m` (N,) is the distance from the hull to obstacles. The speed is 0 from arc
-    length `stop_m` on. A `start_speed` from which this cannot be met is braked with the whole
-    acceleration limit.
+    `clearance_m` (N,) is the distance from the hull to obstacles. The speed is 0 from arc length `stop_m` on. `start` =
+    (speed m/s, acceleration along the way m/s2) at the first point. Where that leaves no way to meet what comes with
+    the jerk allowed, up to eight times as much is taken; where that is not enough, it is braked with the whole
+    acceleration limit at once. With an infinite jerk limit it is braked as late as can be.
     """
     count, step = len(points), spacing_of(points)
     s = step * np.arange(count)
     end_m = max(min(stop_m, float(s[-1])), 0.0)
-    cap = np.minimum(_by_shape(points, limits, config), _by_nearness(clearance_m, config))
+    accel = config.along_share * limits.accel
+    across = config.lateral_share * limits.accel, config.across_jerk_share * limits.jerk
+    cap = np.minimum(by_shape(points, limits, along=accel, across=across), _by_nearness(clearance_m, config))
     left = np.maximum(end_m - s, 0.0)
-    cap = np.minimum(cap, np.minimum(config.approach_gain_per_s * left, limits.speed))
-    gain = 2.0 * config.along_share * limits.accel
-    squared = np.minimum(cap**2, gain * left)
-    squared = np.minimum.accumulate((squared + gain * s)[::-1])[::-1] - gain * s  # braking in time
-    reach = np.minimum(squared - gain * s, start_speed**2)
-    squared = np.minimum.accumulate(reach) + gain * s  # speeding up from the start
-    squared = np.maximum(squared, start_speed**2 - 2.0 * limits.accel * s)
+    cap = np.minimum(cap, config.approach_gain_per_s * left)
+    squared = np.minimum(cap**2, 2.0 * accel * left)
+    if step > 0.0:
+        squared = _ramped(squared, step, start, accel=accel, jerk=config.along_jerk_share * limits.jerk)
+    squared = np.maximum(squared, start[0] ** 2 - 2.0 * limits.accel * s)
     speeds: Array = np.sqrt(np.maximum(squared, 0.0))
     return speeds
 
 
-def spacing_of(points: Array) -> float:
-    """Distance between the first two of evenly spaced points, m."""
-    return float(np.linalg.norm(points[1] - points[0])) if len(points) > 1 else 0.0
+def _ramped(caps: Array, step_m: float, start: tuple[float, float], *, accel: float, jerk: float) -> Array:
+    """Squared speeds (N,) below the caps (N,) that speed up, slow down, and change between the two as allowed."""
+    for harsher in _HARSHER:
+        squared, met = jerk_limited(caps, step_m, along=(accel, harsher * jerk), start=start)
+        if met:
+            break
+    return squared
 
 
 def _by_nearness(clearance_m: Array, config: SpeedConfig) -> Array:
@@ -96,31 +107,6 @@ def _by_nearness(clearance_m: Array, config: SpeedConfig) -> Array:
     return config.near_speed_m_s + config.near_gain_per_s * beyond
 
 
-def curvature(points: Array) -> Array:
-    """1/m (N,) at evenly spaced points, over a few points to both sides."""
-    bend = np.zeros(len(points))
-    m = min(_BEND_POINTS, (len(points) - 1) // 2)
-    if m == 0:
-        return bend
-    before, after = points[m:-m] - points[: -2 * m], points[2 * m :] - points[m:-m]
-    lengths = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
-    turn = after / np.maximum(lengths[1], 1e-9)[:, None] - before / np.maximum(lengths[0], 1e-9)[:, None]
-    bend[m:-m] = np.linalg.norm(turn, axis=1) / np.maximum(0.5 * (lengths[0] + lengths[1]), 1e-9)
-    return bend
-
-
 def strain(points: Array, speeds: Array, accel: float) -> float:
     """Largest lateral acceleration over the limit; above 1 no vehicle can follow at these speeds."""
     return float(np.max(speeds**2 * curvature(points))) / accel
-
-
-def _by_shape(points: Array, limits: Limits, config: SpeedConfig) -> Array:
-    """Speed, climb, and sqrt(lateral acceleration / curvature)."""
-    if len(points) < 3:
-        return np.full(len(points), min(limits.speed, limits.climb))
-    way = np.gradient(points, axis=0)
-    steep = np.abs(way[:, 2]) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
-    curve = np.sqrt(config.lateral_share * limits.accel / np.maximum(curvature(points), 1e-6))
-    climb = limits.climb / np.maximum(steep, 1e-6)
-    speeds: Array = np.minimum(np.minimum(curve, climb), limits.speed)
-    return speeds

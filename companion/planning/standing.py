@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from companion.core.messages import Goal
+from companion.planning.bends import spacing_of
 from companion.planning.flown import SLOW_M_S, Flown
 from companion.planning.polyline import length, project
 from companion.planning.situation import Situation
-from companion.planning.speed_profile import SpeedConfig, known_free_m, spacing_of
+from companion.planning.speed_profile import SpeedConfig, known_free_m
 
 _WAY_LEFT_M = 0.3  # a way that stops sooner counts as standing
 _KNOWN_M = 2.0  # so much known way ends creeping

@@ -32,6 +32,7 @@ def warm_up(config: PlanningConfig, *, hull_radius_m: float) -> None:
         speed=1.0,
         climb=1.0,
         accel=1.0,
+        jerk=20.0,
         yaw_rate=1.0,
         clearance=0.1,
         unknown="stop_before",
@@ -46,7 +47,7 @@ def warm_up(config: PlanningConfig, *, hull_radius_m: float) -> None:
         config.speed,
         hull_radius_m=radius,
         known_radius_m=radius,
-        start_speed=0.0,
+        start=(0.0, 0.0),
         reach_m=0.0,
     )
 

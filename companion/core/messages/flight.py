@@ -14,6 +14,7 @@ class Limits:
     speed: float  # m/s
     climb: float  # m/s
     accel: float  # m/s2
+    jerk: float  # m/s3
     yaw_rate: float  # rad/s
     clearance: float  # hull to obstacle, m
     unknown: Literal["blocked", "stop_before", "optimistic"]

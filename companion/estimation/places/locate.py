@@ -1,7 +1,7 @@
 """Where in a saved map is what is seen: any map of occupied places, with trunks or without.
 
 Windows of about a second are looked up one by one. Where trunks stand their constellation
-proposes a place, elsewhere the panorama does; registration in space confirms it or refuses. A
+proposes a place, elsewhere every place of the map is tried; registration in space confirms it or refuses. A
 window alone may be unsure: the search answers when one is sure, and says nothing otherwise.
 """
 
@@ -18,10 +18,10 @@ from companion.core.messages import Array, Array32
 from companion.estimation.downsample import Thinner
 from companion.estimation.places.constellation import Place, accepted, constellation, match
 from companion.estimation.places.correlate import HitMap
+from companion.estimation.places.likeliest import CoarseMap, LikeliestConfig
 from companion.estimation.places.submap import CompareConfig, best_fit, turn_z
 from companion.estimation.places.trunks import TrunkConfig, detect_trunks
 from companion.estimation.places.verify import Alignment, VerifyConfig, align
-from companion.estimation.places.views import ViewConfig, panorama, panoramas, sights
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -31,14 +31,15 @@ class LocateConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     compare: CompareConfig = CompareConfig(
         verify=VerifyConfig(near_m=0.25, least_near=0.6, settled_m=5e-3, iterations=20),
-        view=ViewConfig(most_places=24, elsewhere_m=1.2),
-        view_verify=VerifyConfig(near_m=0.2, least_near=0.9, settled_m=5e-3, iterations=20),
-        view_turn_rad=3.2,
+        view_verify=VerifyConfig(near_m=0.2, least_near=0.85, settled_m=5e-3, iterations=20, slides=4),
         view_lead=0.97,
+        view_misfits=3.0,
     )
+    likeliest: LikeliestConfig = LikeliestConfig()
     map_trunks: TrunkConfig = TrunkConfig(cell_m=0.2, least_points=6, roundness_m=0.12)
     """Of the map, whose voxels are coarse."""
-    reach_m: Positive = 20.0  # of the map about a guess that takes part in registration
+    reach_m: Positive = 20.0  # of the map about a guess that takes part in registration ...
+    beyond_m: Positive = 2.0  # ... which reaches so much farther than the points of a view that do
     thin_m: Positive = 0.12  # of the views
     agree_m: Positive = 0.5  # two views that name places nearer than this say the same
 
@@ -68,17 +69,18 @@ class Locator:
         self._points, self._eyes = points_map, eyes_map
         trunks = detect_trunks(points_map.astype(np.float64), config.map_trunks)
         self.sky = constellation(trunks.centers, config.compare.constellation)
-        self._panoramas: Array32 | None = None  # only asked for where no trunks stand
-        self._hits: HitMap | None = None
+        self._grids: tuple[CoarseMap, HitMap] | None = None  # only asked for where no trunks stand
 
     def look(self, points_view: Array32) -> Located | None:
         """Find the levelled frame of points (N, 3), m, its origin at the vehicle; None: not sure."""
         seen = detect_trunks(points_view.astype(np.float64), self.config.compare.trunks)
         sky = constellation(seen.centers, self.config.compare.constellation)
         place = accepted(match(self.sky, sky, self.config.compare.constellation), self.config.compare.constellation)
+        far2 = (self.config.reach_m - self.config.beyond_m) ** 2
+        near = points_view[np.einsum("ij,ij->i", points_view[:, :2], points_view[:, :2]) < far2]
         if place is not None:
-            return _located(self._by_trunks(place, points_view), "trunks")
-        return _located(self._by_view(points_view), "view")
+            return _located(self._by_trunks(place, near), "trunks")
+        return _located(self._by_view(near), "view")
 
     def _by_trunks(self, place: Place, points_view: Array32) -> Alignment | None:
         near = self._about(place.p_map)
@@ -89,15 +91,16 @@ class Locator:
         return align(near, points_view, guess, self.config.compare.verify)
 
     def _by_view(self, points_view: Array32) -> Alignment | None:
-        compare = self.config.compare
-        if self._panoramas is None or self._hits is None:
-            self._panoramas = panoramas(self._points, self._eyes, compare.view)
-            self._hits = HitMap(self._points, compare.correlate)
-        places = sights(self._panoramas, self._eyes, panorama(points_view, compare.view), compare.view)
-        return best_fit(self._points, self._hits, points_view, places, compare)
+        if self._grids is None:
+            self._grids = (
+                CoarseMap(self._points, self.config.likeliest),
+                HitMap(self._points, self.config.compare.correlate),
+            )
+        places = self._grids[0].likeliest(self._eyes, points_view)
+        return best_fit(self._about, self._grids[1], points_view, places, self.config.compare)
 
     def _about(self, p_map: Array) -> Array32:
-        gap = self._points[:, :2] - p_map.astype(np.float32)
+        gap = self._points[:, :2] - p_map[:2].astype(np.float32)
         near: Array32 = self._points[np.einsum("ij,ij->i", gap, gap) < self.config.reach_m**2]
         return near
 
@@ -105,8 +108,8 @@ class Locator:
 class Search:
     """One search: feed it views about a second apart until it answers.
 
-    Each is looked up together with those before it. What trunks say is sure at once; what a panorama
-    says counts when the next view says it again, since halls and tunnels repeat themselves.
+    Each is looked up together with those before it. What trunks say is sure at once; what was tried all over
+    the map counts when the next view says it again, since halls and tunnels repeat themselves.
     """
 
     def __init__(self, locator: Locator) -> None:

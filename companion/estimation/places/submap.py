@@ -9,6 +9,7 @@ better than others elsewhere: aisles look alike.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -28,7 +29,7 @@ from companion.estimation.places.constellation import (
 )
 from companion.estimation.places.correlate import CorrelateConfig, HitMap
 from companion.estimation.places.trunks import TrunkConfig, detect_trunks
-from companion.estimation.places.verify import Alignment, VerifyConfig, align
+from companion.estimation.places.verify import Alignment, Known, VerifyConfig, align
 from companion.estimation.places.views import Sight, ViewConfig, eyes_about, panorama, panoramas, sights
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -52,7 +53,9 @@ class CompareConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     most_fits: Count = 4  # guesses that are registered, of those that most points hit
     view_turn_rad: Positive = 0.35  # most that heading by odometry may be wrong when panoramas are compared
     view_lead: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.9
-    """The second best fit, elsewhere, may have at most this share of the points that fit of the best one."""
+    """The second best fit, elsewhere, may have at most this share of the points that fit of the best one ..."""
+    view_misfits: Annotated[float, msgspec.Meta(ge=1)] = 1.0
+    """... and has at least so many times its points that do not: where all is seen again, few are left over."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,24 +138,32 @@ def _by_view(old: Submap, new: Submap, expected: Array, gate_m: float) -> Match 
     places = sights(panoramas(old.cloud, eyes, config.view), eyes, new.panorama, config.view)
     places = [s for s in places if abs(s.yaw) <= config.view_turn_rad]
     near = new.cloud[np.einsum("ij,ij->i", new.cloud, new.cloud) < config.view_reach_m**2]
-    aligned = best_fit(old.cloud, old.hits, near, places, config)
+    aligned = best_fit(lambda _: old.cloud, old.hits, near, places, config)
     return None if aligned is None else Match(aligned.R, aligned.p, 0, aligned.near)
 
 
 def best_fit(
-    known: Array32, hits: HitMap, seen: Array32, places: list[Sight], config: CompareConfig
+    known: Callable[[Array], Array32 | Known],
+    hits: HitMap,
+    seen: Array32,
+    places: list[Sight],
+    config: CompareConfig,
 ) -> Alignment | None:
-    """Register cloud `seen` at the likeliest places of `known`; the fit that leads all others elsewhere, or None."""
+    """Register cloud `seen` at the likeliest places; the fit that leads all others elsewhere, or None.
+
+    `known` gives what is known about a place (3,).
+    """
     points = hits.thinned(seen)
     guesses = sorted((hits.refined(points, s.p_map, s.yaw) for s in places), key=lambda guess: -guess[2])
     loose = msgspec.structs.replace(config.view_verify, least_near=0.3)
-    fits = [align(known, seen, (turn_z(yaw), p), loose) for p, yaw in _apart(guesses)[: config.most_fits]]
+    fits = [align(known(p), seen, (turn_z(yaw), p), loose) for p, yaw in _apart(guesses)[: config.most_fits]]
     ranked = sorted((f for f in fits if f is not None), key=lambda f: -f.near)
     if not ranked or ranked[0].near < config.view_verify.least_near:
         return None
     best = ranked[0]
-    others = [f.near for f in ranked[1:] if np.linalg.norm(f.p - best.p) > _ELSEWHERE_M]
-    return best if max(others, default=0.0) <= config.view_lead * best.near else None
+    rival = max((f.near for f in ranked[1:] if np.linalg.norm(f.p - best.p) > _ELSEWHERE_M), default=0.0)
+    leads = rival <= config.view_lead * best.near and 1.0 - rival >= config.view_misfits * (1.0 - best.near)
+    return best if leads else None
 
 
 def _apart(guesses: list[tuple[Array, float, float]]) -> list[tuple[Array, float]]:

@@ -20,7 +20,7 @@ from companion.planning.space import FieldSpace
 from companion.planning.speed_profile import SpeedConfig, speed_profile
 from companion.runtime.bench.tracking_pilot import Course
 
-HULL_M, CLEARANCE_M, ACCEL = 0.36, 0.6, 5.0
+HULL_M, CLEARANCE_M, ACCEL, JERK = 0.36, 0.6, 5.0, 40.0
 HEIGHT_M = 3.0
 _RESOLUTION_M, _FIELD_M = 0.2, 3.0
 
@@ -53,11 +53,11 @@ def paced(name: str, path: Array, *, top_m_s: float, space: FieldSpace | None = 
     config = SpeedConfig()
     points = resample(path, config.spacing_m)
     limits = Limits(
-        speed=top_m_s, climb=3.0, accel=ACCEL, yaw_rate=1.5, clearance=CLEARANCE_M, unknown="optimistic",
+        speed=top_m_s, climb=3.0, accel=ACCEL, jerk=JERK, yaw_rate=1.5, clearance=CLEARANCE_M, unknown="optimistic",
         agl_min=0.5, agl_max=10.0,
     )  # fmt: skip
     clearance_m = np.full(len(points), 10.0) if space is None else space.distance(points) - HULL_M
-    speeds = speed_profile(points, limits, config, clearance_m=clearance_m, start_speed=0.0)
+    speeds = speed_profile(points, limits, config, clearance_m=clearance_m, start=(0.0, 0.0))
     return Course(name=name, points=points, speeds=speeds, limit_m_s=top_m_s, accel=ACCEL)
 
 

@@ -34,7 +34,8 @@ def goal(k):
         stamp_ns=k, id=k, kind="fly", p_odom=np.array([1.0, 2.0, 3.0]), agl_m=float("nan"), radius_m=0.5,
         fly_through=False, next_p_odom=np.zeros((0, 3)), yaw=0.0, if_blocked="fail",
         limits=m.Limits(
-            speed=1.0, climb=1.0, accel=1.0, yaw_rate=1.0, clearance=0.3, unknown="blocked", agl_min=0.0, agl_max=5.0
+            speed=1.0, climb=1.0, accel=1.0, jerk=10.0, yaw_rate=1.0, clearance=0.3, unknown="blocked",
+            agl_min=0.0, agl_max=5.0,
         ),
     )  # fmt: skip
 

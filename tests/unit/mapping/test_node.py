@@ -62,7 +62,15 @@ def test_points_land_where_the_pose_puts_them():
 
 def goal(unknown):
     limits = Limits(
-        speed=3.0, climb=1.0, accel=3.0, yaw_rate=1.5, clearance=0.4, unknown=unknown, agl_min=1.0, agl_max=6.0
+        speed=3.0,
+        climb=1.0,
+        accel=3.0,
+        jerk=20.0,
+        yaw_rate=1.5,
+        clearance=0.4,
+        unknown=unknown,
+        agl_min=1.0,
+        agl_max=6.0,
     )
     return Goal(
         stamp_ns=0,

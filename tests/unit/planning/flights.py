@@ -10,7 +10,15 @@ from companion.tracking.node import TrackingConfig, TrackingNode
 
 HULL_M = 0.35
 LIMITS = Limits(
-    speed=3.0, climb=1.0, accel=3.0, yaw_rate=1.5, clearance=0.4, unknown="stop_before", agl_min=1.0, agl_max=6.0
+    speed=3.0,
+    climb=1.0,
+    accel=3.0,
+    jerk=20.0,
+    yaw_rate=1.5,
+    clearance=0.4,
+    unknown="stop_before",
+    agl_min=1.0,
+    agl_max=6.0,
 )
 STEP_S = 0.01
 DELAY_STEPS = 3  # a plan arrives 30 ms late

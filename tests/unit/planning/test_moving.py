@@ -94,13 +94,21 @@ def test_one_gets_out_of_the_way_of_what_comes_as_fast_as_what_stands_allows(loc
     aside = np.array([[4.0, 5.0, 2.0], [4.0, 8.5, 2.0]])
 
     limits = Limits(
-        speed=2.5, climb=1.0, accel=3.0, yaw_rate=1.0, clearance=0.4, unknown="optimistic", agl_min=0.0, agl_max=5.0
+        speed=2.5,
+        climb=1.0,
+        accel=3.0,
+        jerk=20.0,
+        yaw_rate=1.0,
+        clearance=0.4,
+        unknown="optimistic",
+        agl_min=0.0,
+        agl_max=5.0,
     )
 
     def speed_at(metres, still_map, path=aside):
         radii = {"hull_radius_m": 0.36, "known_radius_m": 0.76}
         flown = with_speeds(
-            path, space, limits, SpeedConfig(), **radii, start_speed=0.0, reach_m=3.5, still_map=still_map
+            path, space, limits, SpeedConfig(), **radii, start=(0.0, 0.0), reach_m=3.5, still_map=still_map
         )
         return flown.speed_at(metres)
 

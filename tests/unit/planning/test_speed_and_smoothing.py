@@ -8,22 +8,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.messages import Limits
+from companion.planning.bends import curvature
 from companion.planning.flown import Flown, with_speeds
 from companion.planning.polyline import arc_length, length, project, resample
 from companion.planning.rrt_star import RRTStar, RRTStarConfig
 from companion.planning.smooth import SmoothConfig, smooth
 from companion.planning.space import FieldSpace
-from companion.planning.speed_profile import SpeedConfig, curvature, known_free_m, speed_profile
+from companion.planning.speed_profile import SpeedConfig, known_free_m, speed_profile
 
 LIMITS = Limits(
-    speed=3.0, climb=1.0, accel=3.0, yaw_rate=1.0, clearance=0.4, unknown="stop_before", agl_min=0.5, agl_max=5.0
+    speed=3.0,
+    climb=1.0,
+    accel=3.0,
+    jerk=20.0,
+    yaw_rate=1.0,
+    clearance=0.4,
+    unknown="stop_before",
+    agl_min=0.5,
+    agl_max=5.0,
 )
 CONFIG = SpeedConfig()
 
 
-def profile(points, *, start=0.0, stop_m=np.inf, clearance=np.inf, limits=LIMITS):
+def profile(points, *, start=0.0, accel_start=0.0, stop_m=np.inf, clearance=np.inf, limits=LIMITS):
     near = np.broadcast_to(clearance, len(points))
-    return speed_profile(points, limits, CONFIG, clearance_m=near, start_speed=start, stop_m=stop_m)
+    return speed_profile(points, limits, CONFIG, clearance_m=near, start=(start, accel_start), stop_m=stop_m)
 
 
 def straight(total_m=12.0):
@@ -76,7 +85,7 @@ def test_it_can_always_stop_before_the_first_unknown(local_map, seed):
     space = FieldSpace(local_map(np.zeros(known.shape, bool), known=known), radius_m=0.85)
     path = np.array([[1.0, 4.0, 2.0], [19.0, rng.uniform(2, 6), 2.4]])
     flown = with_speeds(
-        path, space, LIMITS, CONFIG, hull_radius_m=0.35, known_radius_m=0.75, start_speed=0.0, reach_m=18.0
+        path, space, LIMITS, CONFIG, hull_radius_m=0.35, known_radius_m=0.75, start=(0.0, 0.0), reach_m=18.0
     )
     points, speeds = flown.ahead_until_stop
     unknown = np.argwhere(~known) * 0.2 + 0.1

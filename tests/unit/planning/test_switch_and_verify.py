@@ -71,7 +71,7 @@ def test_a_raw_way_that_smoothing_makes_longer_does_not_replace_the_smooth_old_o
 
 def straight(space, limits):
     path, radii = np.array([[2.0, 6.0, 2.0], [28.0, 6.0, 2.0]]), {"hull_radius_m": 0.35, "known_radius_m": 0.35}
-    return with_speeds(path, space, limits, SPEED, **radii, start_speed=0.0, reach_m=26.0)
+    return with_speeds(path, space, limits, SPEED, **radii, start=(0.0, 0.0), reach_m=26.0)
 
 
 def test_a_way_into_a_post_is_hit_where_the_hull_meets_it_and_a_free_one_nowhere(local_map, flights):

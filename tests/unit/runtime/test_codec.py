@@ -8,7 +8,7 @@ from companion.core.messages import CameraImage, Goal, Limits, LocalMap, Mavlink
 from companion.runtime.codec import decode, digest, encode, summed
 
 LIMITS = Limits(
-    speed=2.0, climb=1.0, accel=2.0, yaw_rate=1.0, clearance=0.5, unknown="blocked", agl_min=0.5, agl_max=9.0
+    speed=2.0, climb=1.0, accel=2.0, jerk=10.0, yaw_rate=1.0, clearance=0.5, unknown="blocked", agl_min=0.5, agl_max=9.0
 )
 RNG = np.random.default_rng(1)
 
