@@ -41,7 +41,6 @@ LIKELIHOOD = Topic("estimation/likelihood", m.PoseLikelihood, 25.0, "all")
 REGISTERED = Topic("estimation/registered_scan", m.RegisteredScan, 10.0, recorded=False, service="bulk")
 ODOMETRY = Topic("estimation/odometry", m.Odometry, 100.0, deadline_s=0.2, service="control")
 SMOOTHED = Topic("estimation/smoothed", m.SmoothedState, 10.0)
-JOINT_STATE = Topic("estimation/joint_state", m.LioState, 0.0)  # 10 Hz where a joint window runs
 CORRECTIONS = Topic("estimation/corrections", m.PoseCorrections, 0.0, service="latched")
 MAP_FROM_ODOM = Topic("estimation/map_from_odom", m.MapFromOdom, 0.0, service="latched")
 OBSTACLE_TRACKS = Topic("estimation/obstacle_tracks", m.ObstacleTracks, 0.0)  # 5 Hz while there are any

@@ -13,7 +13,6 @@ from companion.estimation.lio import LioConfig
 from companion.estimation.loop_node import LoopNodeConfig
 from companion.estimation.ordering import OrderConfig
 from companion.estimation.tracks.node import ObstacleTracksConfig
-from companion.estimation.window.joint_window import JointWindowConfig
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -37,6 +36,5 @@ class EstimationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     propagator: PropagatorConfig = PropagatorConfig()
     back_end: Literal["graph", "none"] = "graph"  # none: the filter alone, for small computers; map stays odom
     graph: GraphConfig = GraphConfig()
-    joint_window: JointWindowConfig = JointWindowConfig()
     loops: LoopNodeConfig = LoopNodeConfig()
     obstacle_tracks: ObstacleTracksConfig = ObstacleTracksConfig()

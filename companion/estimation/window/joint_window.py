@@ -1,6 +1,6 @@
 """The last sweeps and the IMU between them, estimated jointly by Gauss-Newton; what is older is a prior and a map.
 
-    window = JointWindow(start, map, JointWindowConfig(), lio, rig)
+    window = JointWindow(Course(start), PointMap(lio.map), JointWindowConfig(), lio, rig)
     window.predict(imu)                       # (N, 7): dt, rate, specific force
     window.add_sweep(points_sensor, age_s)    # all sweeps of the window are registered anew, together
     window.filter.state.p, window.covariance
@@ -17,7 +17,7 @@ Source: the window is that of T. Shan et al., "LIO-SAM", IROS 2020, with sweeps 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
@@ -29,7 +29,7 @@ from companion.estimation.blind_axes import BlindAxes
 from companion.estimation.course import Course
 from companion.estimation.downsample import Thinner
 from companion.estimation.filter import Filter, is_small
-from companion.estimation.lio import LioConfig
+from companion.estimation.imu_doubt import gap_covariance
 from companion.estimation.map_error import MapError
 from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap
@@ -39,6 +39,9 @@ from companion.estimation.window.joint_planes import Sweep, associate, linearise
 from companion.estimation.window.preintegration import NODE_ERROR, ImuResidual, Preintegrated, imu_residual, preintegrate
 from companion.estimation.window.prior import Prior, eliminate, pose_equations
 
+if TYPE_CHECKING:  # of the front end, which has a rescue that has a window
+    from companion.estimation.lio import LioConfig
+
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
@@ -46,7 +49,7 @@ class JointWindowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     """How much is estimated jointly."""
 
     sweeps: Annotated[int, msgspec.Meta(ge=1, le=40)] = 6
-    iterations: Count = 4  # Gauss-Newton, per sweep
+    iterations: Count = 10  # Gauss-Newton, per sweep
 
 
 @dataclass(slots=True)
@@ -64,13 +67,25 @@ class Node:
 class JointWindow:
     """`filter` holds the newest state, predicted by the IMU beyond the newest node, and its covariance."""
 
-    def __init__(self, start: Filter, target: PointMap, config: JointWindowConfig, lio: LioConfig, rig: Rig) -> None:
-        self.config, self._lio, self.map = config, lio, target
-        self._course = Course(start)
+    def __init__(
+        self,
+        course: Course,
+        target: PointMap,
+        config: JointWindowConfig,
+        lio: LioConfig,
+        rig: Rig,
+        *,
+        grows: bool = True,
+    ) -> None:
+        """It begins where `course` is, which it takes over; `grows`: sweeps that leave the window enter the map."""
+        start = course.filter
+        self.config, self._lio, self.map, self._grows = config, lio, target, grows
+        self.course = course
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
         self._nodes = [Node(0, start.state.copy(), None, start.P[:6, :6].copy())]
         self._prior = Prior(start.state.copy(), np.linalg.inv(start.P), np.zeros(ERROR))
         self._imu: list[Array] = []
+        self._hidden = np.zeros((9, 9))  # covariance of what the IMU has not told since the newest node
         self._thinner, self._map_error = Thinner(), MapError()
         self._blind = BlindAxes(lio.blind)
         self._oldest_P = start.P[:6, :6].copy()
@@ -79,7 +94,7 @@ class JointWindow:
     @property
     def filter(self) -> Filter:
         """State, covariance and time of now."""
-        return self._course.filter
+        return self.course.filter
 
     @property
     def covariance(self) -> Array:
@@ -87,19 +102,25 @@ class JointWindow:
         return self.filter.P + self._map_error.covariance(self.filter.state)
 
     @property
-    def oldest(self) -> State:
-        """The state that leaves next: what it is cannot be improved much."""
-        return self._nodes[0].state
+    def newest_points(self) -> Array:
+        """Of the newest sweep, (N, 3), body frame: those that are registered."""
+        sweeps = self._sweeps()
+        return sweeps[-1][1].points if sweeps else np.empty((0, 3))
 
-    def predict(self, imu: Array) -> None:
-        """Advance through IMU pieces (N, 7): dt, rate, specific force."""
-        if len(imu):
-            self._course.predict(imu, self._lio.noise.densities)
-            self._imu.append(imu)
+    def predict(self, imu: Array, *, gap_s: float = 0.0) -> None:
+        """Advance through IMU pieces (N, 7): dt, rate, specific force; `gap_s`: the longest time without a sample."""
+        if not len(imu):
+            return
+        self.course.predict(imu, self._lio.noise.densities)
+        self._imu.append(imu)
+        if gap_s > self._lio.imu_doubt.gap_s:
+            hidden = gap_covariance(gap_s, self._lio.imu_doubt)
+            self.filter.P[:9, :9] += hidden
+            self._hidden = self._hidden + hidden
 
     def add_sweep(self, points_sensor: Array32, age_s: Array32) -> Array32:
         """Take a sweep (N, 3) that ends now, each point `age_s` (N,) ago; returns it deskewed, body frame."""
-        body = self._course.deskewed(points_sensor, age_s, self._mount, self._lio.gate)
+        body = self.course.deskewed(points_sensor, age_s, self._mount, self._lio.gate)
         self.add_points(body)
         return body
 
@@ -124,8 +145,9 @@ class JointWindow:
         newest, f = self._nodes[-1], self.filter
         if not self._imu:
             return newest
-        imu = preintegrate(np.concatenate(self._imu), newest.state.x[15:21], self._lio.noise.densities)
-        self._imu = []
+        pieces, densities = np.concatenate(self._imu), self._lio.noise.densities
+        imu = preintegrate(pieces, newest.state.x[15:21], densities, hidden=self._hidden)
+        self._imu, self._hidden = [], np.zeros((9, 9))
         self._nodes.append(Node(newest.number + 1, f.state.copy(), imu, f.P[:6, :6].copy()))
         return self._nodes[-1]
 
@@ -163,7 +185,7 @@ class JointWindow:
 
     def _solve(self) -> None:
         """Gauss-Newton over all nodes and gravity; leaves the newest state and its covariance in `filter`."""
-        before = self._course.pose()
+        before = self.course.pose()
         for _ in range(self.config.iterations):
             self._search_again()
             H, g = self._normal_equations()
@@ -176,7 +198,7 @@ class JointWindow:
         self.filter.state.x[:] = self._nodes[-1].state.x
         self.filter.P = _marginal(root, np.arange(len(g) - ERROR, len(g)), len(g))
         self._oldest_P = _marginal(root, np.arange(6), len(g))
-        self._course.moved(before)
+        self.course.moved(before)
 
     def _search_again(self) -> None:
         beyond_m = self._lio.plane.search_again_m
@@ -249,7 +271,7 @@ class JointWindow:
         R, p = node.state.R.copy(), node.state.p.copy()
         for _, other in self._sweeps():
             other.freeze(node.number, R, p)
-        if not self._is_of_use(sweep):
+        if not self._grows or not self._is_of_use(sweep):
             return
         share = self.map.insert(sweep.spaced, R, p) / max(len(sweep.spaced), 1)
         self._map_error.move(p)

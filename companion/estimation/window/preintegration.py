@@ -42,12 +42,17 @@ class ImuResidual:
     by_gravity: Array  # (15, 3)
 
 
-def preintegrate(imu: Array, biases: Array, densities: Array) -> Preintegrated:
-    """Pieces (N, 7) of dt, rate, specific force; biases (6,); densities (4,) of `ImuNoise`."""
+def preintegrate(imu: Array, biases: Array, densities: Array, *, hidden: Array | None = None) -> Preintegrated:
+    """Pieces (N, 7) of dt, rate, specific force; biases (6,); densities (4,) of `ImuNoise`.
+
+    `hidden` (9, 9): covariance of what the pieces do not tell of attitude, position and velocity, as in a gap.
+    """
     dR, moved = np.eye(3), np.zeros(6)
     F, S = np.eye(NODE_ERROR), np.zeros((NODE_ERROR, NODE_ERROR))
     _preintegrate(np.ascontiguousarray(imu), biases, densities, dR, moved, F, S)
     S[np.arange(3, 6), np.arange(3, 6)] += _SHORTEST_M2
+    if hidden is not None:
+        S[:9, :9] += hidden
     root = np.linalg.cholesky(np.linalg.inv(0.5 * (S + S.T))).T
     seconds = float(imu[:, 0].sum())
     return Preintegrated(seconds, dR, moved[:3], moved[3:], biases.copy(), F[:9, 9:].copy(), root)

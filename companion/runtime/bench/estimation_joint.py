@@ -9,10 +9,11 @@ import numpy as np
 
 from companion.core.geometry import quaternion_from_rotation, rotation_from_quaternion
 from companion.core.messages import Array, ImuSample, LidarScan, LioState, PoseLikelihood, RegisteredScan, Why
-from companion.core.node import Node, Output, on
+from companion.core.node import Node, Output, Topic, on
 from companion.core.rig import Rig
-from companion.core.topics import IMU, JOINT_STATE, LIDAR, LIKELIHOOD, LIO_STATE, REGISTERED, WHY
+from companion.core.topics import IMU, LIDAR, LIKELIHOOD, LIO_STATE, REGISTERED, WHY
 from companion.estimation.config import EstimationConfig
+from companion.estimation.course import Course
 from companion.estimation.filter import Filter
 from companion.estimation.imu_doubt import new_buffer
 from companion.estimation.normal import Normal
@@ -21,6 +22,7 @@ from companion.estimation.point_map import PointMap
 from companion.estimation.state import State
 from companion.estimation.window.joint_window import JointWindow
 
+JOINT_STATE = Topic("bench/joint_state", LioState, 10.0)
 _MOVES_M_S = 0.3
 _LATE_NS = 500_000_000  # sweeps of the last moment before it is known to move are held where they are not
 
@@ -89,7 +91,7 @@ class JointWindowNode(Node):
     def _begin(self, state: LioState) -> None:
         start = Filter(_state_of(state), np.array(state.covariance), 0.0)
         c = self._config
-        self.window = JointWindow(start, self._map, c.joint_window, c.lio, self._rig)
+        self.window = JointWindow(Course(start), self._map, c.lio.rescue.window, c.lio, self._rig)
         self._zero_ns = self._time_ns = state.stamp_ns
 
     def _queue(self, stream: str, measurement: LidarScan | PoseLikelihood) -> Iterator[Output]:
@@ -108,7 +110,8 @@ class JointWindowNode(Node):
 
     def _take(self, window: JointWindow, measurement: LidarScan | PoseLikelihood) -> Iterator[Output]:
         stamp_ns = measurement.stamp_ns
-        window.predict(self._imu.between(self._time_ns, stamp_ns))
+        when = self._time_ns, stamp_ns
+        window.predict(self._imu.between(*when), gap_s=self._imu.longest_gap_s(*when))
         self._time_ns = stamp_ns
         window.filter.t_s = (stamp_ns - self._zero_ns) * 1e-9  # no rounding adds up
         if isinstance(measurement, PoseLikelihood):
