@@ -88,7 +88,6 @@ class JointWindow:
         self._hidden = np.zeros((9, 9))  # covariance of what the IMU has not told since the newest node
         self._thinner, self._map_error = Thinner(), MapError()
         self._blind = BlindAxes(lio.blind)
-        self._oldest_P = start.P[:6, :6].copy()
         self.normal: Normal | None = None  # what the newest sweep said of its own pose
 
     @property
@@ -197,7 +196,6 @@ class JointWindow:
                 break
         self.filter.state.x[:] = self._nodes[-1].state.x
         self.filter.P = _marginal(root, np.arange(len(g) - ERROR, len(g)), len(g))
-        self._oldest_P = _marginal(root, np.arange(6), len(g))
         self.course.moved(before)
 
     def _search_again(self) -> None:
@@ -267,7 +265,11 @@ class JointWindow:
                 self._into_map(oldest, oldest.sweep)
 
     def _into_map(self, node: Node, sweep: Sweep) -> None:
-        """A sweep that has left the window, with the pose that it had at last."""
+        """A sweep that has left the window, with the pose that it had at last.
+
+        The map's error grows by the newest pose's covariance, not by the smaller one of this pose: what the sweeps of
+        a window have in common is wrong in all of them.
+        """
         R, p = node.state.R.copy(), node.state.p.copy()
         for _, other in self._sweeps():
             other.freeze(node.number, R, p)
@@ -275,7 +277,7 @@ class JointWindow:
             return
         share = self.map.insert(sweep.spaced, R, p) / max(len(sweep.spaced), 1)
         self._map_error.move(p)
-        self._map_error.extend(node.state, self._oldest_P, share * self._lio.map_error.share)
+        self._map_error.extend(node.state, self.filter.P, share * self._lio.map_error.share)
 
 
 def _add(H: Array, g: Array, at: Array, equations: tuple[Array, Array]) -> None:

@@ -89,7 +89,7 @@ class JointWindowNode(Node):
         self._time_ns = self._zero_ns = 0
 
     def _begin(self, state: LioState) -> None:
-        start = Filter(_state_of(state), np.array(state.covariance), 0.0)
+        start = Filter(state_of(state), np.array(state.covariance), 0.0)
         c = self._config
         self.window = JointWindow(Course(start), self._map, c.lio.rescue.window, c.lio, self._rig)
         self._zero_ns = self._time_ns = state.stamp_ns
@@ -146,7 +146,8 @@ class JointWindowNode(Node):
         )
 
 
-def _state_of(message: LioState) -> State:
+def state_of(message: LioState) -> State:
+    """The state that a message tells of."""
     state = State(np.zeros(24))
     state.R[:], state.p[:] = rotation_from_quaternion(message.q_odom_body), message.p_odom
     state.v[:], state.g[:] = message.v_odom, message.gravity_odom
