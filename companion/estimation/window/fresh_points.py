@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -37,13 +39,13 @@ class FreshPoints:
         return kept
 
     @property
-    def store(self) -> tuple[Array, ...]:
+    def store(self) -> tuple[NDArray[Any], ...]:
         """Arrays for kernels."""
         return self.keys, self.first, self.counts, self.pool, self.body, self.odom, self.owner
 
 
 def new_to(target: PointMap, body: Array, R: Array, p: Array) -> Flags:
-    """Which of the points (N, 3), carried by R @ x + p, have no point of the map within its spacing (in their voxel)."""
+    """Which of the points (N, 3), by R @ x + p, have no point of the map within its spacing, in their voxel."""
     out = np.empty(len(body), np.bool_)
     store, c = (target.keys, target.value, target.counts, target.pool), target.config
     _new_to(store, body, R, p, 1.0 / c.voxel_m, c.spacing_m**2, out)

@@ -74,9 +74,7 @@ def associate(sweep: Sweep, target: PointMap, fresh: FreshPoints, pose: tuple[Ar
     sweep.searched = R.copy(), p.copy()
 
 
-def linearise(
-    sweep: Sweep, k: int, poses: tuple[Array, Array], first: int, c: PlaneConfig
-) -> tuple[Array, Array]:
+def linearise(sweep: Sweep, k: int, poses: tuple[Array, Array], first: int, c: PlaneConfig) -> tuple[Array, Array]:
     """Normal equations of the sweep of pose k, by all poses (theta_body, p_odom): H (6n, 6n) and g (6n,).
 
     `poses` are rotations (n, 3, 3) and positions (n, 3) of nodes `first` and on. The noise of the points is taken from

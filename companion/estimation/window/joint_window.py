@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from companion.core.messages import Array, Array32
@@ -36,7 +37,13 @@ from companion.estimation.point_map import PointMap
 from companion.estimation.state import ERROR, State
 from companion.estimation.window.fresh_points import FreshPoints, new_to
 from companion.estimation.window.joint_planes import Sweep, associate, linearise
-from companion.estimation.window.preintegration import NODE_ERROR, ImuResidual, Preintegrated, imu_residual, preintegrate
+from companion.estimation.window.preintegration import (
+    NODE_ERROR,
+    ImuResidual,
+    Preintegrated,
+    imu_residual,
+    preintegrate,
+)
 from companion.estimation.window.prior import Prior, eliminate, pose_equations
 
 if TYPE_CHECKING:  # of the front end, which has a rescue that has a window
@@ -83,7 +90,7 @@ class JointWindow:
         self.course = course
         self._mount = (rig.lidar.R_body_sensor, rig.lidar.p_body)
         self._nodes = [Node(0, start.state.copy(), None, start.P[:6, :6].copy())]
-        self._prior = Prior(start.state.copy(), np.linalg.inv(start.P), np.zeros(ERROR))
+        self._prior = Prior(start.state.copy(), np.asarray(np.linalg.inv(start.P), np.float64), np.zeros(ERROR))
         self._imu: list[Array] = []
         self._hidden = np.zeros((9, 9))  # covariance of what the IMU has not told since the newest node
         self._thinner, self._map_error = Thinner(), MapError()
@@ -280,12 +287,12 @@ class JointWindow:
         self._map_error.extend(node.state, self.filter.P, share * self._lio.map_error.share)
 
 
-def _add(H: Array, g: Array, at: Array, equations: tuple[Array, Array]) -> None:
+def _add(H: Array, g: Array, at: NDArray[np.int_], equations: tuple[Array, Array]) -> None:
     H[np.ix_(at, at)] += equations[0]
     g[at] += equations[1]
 
 
-def _marginal(root: tuple[Array, bool], at: Array, size: int) -> Array:
+def _marginal(root: tuple[Array, bool], at: NDArray[np.int_], size: int) -> Array:
     """Covariance of some of the variables, from the Cholesky root of the whole information."""
     columns = np.zeros((size, len(at)))
     columns[at, np.arange(len(at))] = 1.0

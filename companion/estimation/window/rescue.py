@@ -60,7 +60,9 @@ class Rescue:
         if not self._lio.rescue.enabled:
             return None
         if self._window is None:
-            self._window = JointWindow(course.copy(), target, self._lio.rescue.window, self._lio, self._rig, grows=False)
+            self._window = JointWindow(
+                course.copy(), target, self._lio.rescue.window, self._lio, self._rig, grows=False
+            )
         window = self._window
         body = window.add_sweep(points_sensor, age_s)
         self._agreed = self._agreed + 1 if self._agrees(window) else 0
@@ -71,7 +73,7 @@ class Rescue:
         return body, window.normal
 
     def _agrees(self, window: JointWindow) -> bool:
-        """Whether most of what the newest sweep meets in the map lies on it; what the window has seen does not count."""
+        """Whether most of what the newest sweep meets in the map lies on it; what the window saw does not count."""
         scan = PlaneRegistration(window.map, window.newest_points, self._lio.plane)
         state, c = window.filter.state, self._lio.search
         fitting, met, offered = scan.fits(state.R, state.p, c.fits_m)

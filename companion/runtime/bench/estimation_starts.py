@@ -38,7 +38,7 @@ _FOUND_M, _FOUND_RAD = 0.05, np.radians(0.5)
 
 
 class StartRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One estimator from wrong starts, of which it knows the covariance; errors against the filter that was never off."""
+    """One estimator from wrong starts whose covariance it knows; errors against the filter that was never off."""
 
     flight: str
     fault: str
