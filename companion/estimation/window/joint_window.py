@@ -279,7 +279,10 @@ class JointWindow:
         """
         R, p = node.state.R.copy(), node.state.p.copy()
         for _, other in self._sweeps():
-            other.freeze(node.number, R, p)
+            if self._grows:
+                other.freeze(node.number, R, p)
+            else:
+                other.forget(node.number)
         if not self._grows or not self._is_of_use(sweep):
             return
         share = self.map.insert(sweep.spaced, R, p) / max(len(sweep.spaced), 1)
