@@ -34,7 +34,7 @@ WORLDS = {
     "branches=0,roughness_m=0.15,margin_m=30",
 }
 COLUMNS = (
-    "flight", "fault", "estimator", "ATE m", "drift %", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",
+    "flight", "fault", "estimator", "ATE m", "drift %", "1 s m", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",
     "in 3 sigma", "rank", "gap m",
 )  # fmt: skip
 
@@ -184,7 +184,8 @@ def cells(row: EstimationRow) -> list[str]:
     n = row.nees
     parts = (n.tilt, n.yaw, n.velocity, n.gyro_bias, n.accel_bias, n.position) if n else (None,) * 6
     return [
-        row.flight, row.fault, row.estimator, f"{row.ate_m:.3f}", f"{row.drift_percent:.3f}", f"{row.front_ms:.1f}",
+        row.flight, row.fault, row.estimator, f"{row.ate_m:.3f}", f"{row.drift_percent:.3f}",
+        "" if row.relative_m is None else f"{row.relative_m:.3f}", f"{row.front_ms:.1f}",
         f"{row.all_ms:.1f}", *("" if x is None else f"{x:.2f}" for x in (*parts, row.covered, row.quality_rank)),
         f"{np.median([g.error_m for g in row.gaps]):.3f}" if row.gaps else "",
     ]  # fmt: skip

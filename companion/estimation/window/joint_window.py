@@ -55,8 +55,8 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 class JointWindowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How much is estimated jointly."""
 
-    sweeps: Annotated[int, msgspec.Meta(ge=1, le=40)] = 6
-    iterations: Count = 10  # Gauss-Newton, per sweep
+    sweeps: Annotated[int, msgspec.Meta(ge=1, le=40)] = 6  # the last ones
+    iterations: Count = 10  # of Gauss-Newton per sweep, at most: mostly two
 
 
 @dataclass(slots=True)

@@ -26,11 +26,11 @@ _MET = 0.05  # of a sweep's points: fewer on the map say nothing
 
 
 class RescueConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When what the window says is taken."""
+    """Whether a window looks for the place too, and when what it says is taken."""
 
-    enabled: bool = True
+    enabled: bool = True  # where sweeps do not agree with the map after a gap; idle else
     window: JointWindowConfig = JointWindowConfig()
-    in_a_row: Annotated[int, msgspec.Meta(ge=1)] = 3  # sweeps that must agree with the map
+    in_a_row: Annotated[int, msgspec.Meta(ge=1)] = 3  # sweeps of which most must lie on the map
 
 
 class Rescue:
