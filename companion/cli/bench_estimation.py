@@ -34,8 +34,8 @@ WORLDS = {
     "branches=0,roughness_m=0.15,margin_m=30",
 }
 COLUMNS = (
-    "flight", "fault", "estimator", "ATE m", "drift %", "1 s m", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",
-    "in 3 sigma", "rank", "gap m",
+    "flight", "fault", "estimator", "ATE m", "drift %", "1 s m", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba",
+    "p", "in 3 sigma", "rank", "gap m",
 )  # fmt: skip
 
 

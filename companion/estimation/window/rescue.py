@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
+import numpy as np
 
 from companion.core.messages import Array, Array32
 from companion.core.rig import Rig
@@ -59,18 +60,25 @@ class Rescue:
         """
         if not self._lio.rescue.enabled:
             return None
-        if self._window is None:
-            self._window = JointWindow(
-                course.copy(), target, self._lio.rescue.window, self._lio, self._rig, grows=False
-            )
-        window = self._window
-        body = window.add_sweep(points_sensor, age_s)
+        try:
+            window, body = self._registered(course, target, points_sensor, age_s)
+        except np.linalg.LinAlgError:  # what cannot be solved is begun anew with the next sweep
+            self.end()
+            return None
         self._agreed = self._agreed + 1 if self._agrees(window) else 0
-        if self._agreed < self._lio.rescue.in_a_row or window.normal is None:
+        if self._agreed < self._lio.rescue.in_a_row or window.normal is None or not window.filter.is_sound:
             return None
         course.become(window.course)
         self.end()
         return body, window.normal
+
+    def _registered(
+        self, course: Course, target: PointMap, points_sensor: Array32, age_s: Array32
+    ) -> tuple[JointWindow, Array32]:
+        if self._window is None:
+            how = self._lio.rescue.window, self._lio, self._rig
+            self._window = JointWindow(course.copy(), target, *how, grows=False)
+        return self._window, self._window.add_sweep(points_sensor, age_s)
 
     def _agrees(self, window: JointWindow) -> bool:
         """Whether most of what the newest sweep meets in the map lies on it; what the window saw does not count."""

@@ -22,7 +22,7 @@ from companion.estimation.window.joint_planes import Sweep, _place_planes, assoc
 from companion.estimation.window.joint_window import JointWindow, JointWindowConfig
 from companion.estimation.window.preintegration import ImuResidual, imu_residual, preintegrate
 from companion.estimation.window.prior import Prior, eliminate
-from companion.estimation.window.rescue import RescueConfig
+from companion.estimation.window.rescue import Rescue, RescueConfig
 from companion.runtime.bench.estimation_replay import feed
 from tests.unit.estimation.synthetic import record
 from tests.unit.estimation.test_flight import TOPIC, run
@@ -299,6 +299,18 @@ def test_several_sweeps_find_back_where_one_does_not():
     assert after_a_gap(rescue=False)[-1] > 1.0
     errors = after_a_gap(rescue=True)
     assert max(errors[-8:]) < 5e-3
+
+
+def test_a_rescue_survives_what_it_cannot_use():
+    """Sweeps without a return, and a covariance that has no inverse: not found, and ready for the next one."""
+    rng, config = np.random.default_rng(8), LioConfig()
+    nothing = np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    course = Course(begun(np.zeros(3), np.zeros(3), sigma_m=0.1, sigma_rad=0.1))
+    rescue = Rescue(config, RIG)
+    assert rescue.look(course, known_room(rng), *nothing) is None
+    course.filter.P = np.zeros((18, 18))
+    rescue.end()
+    assert rescue.look(course, known_room(rng), *nothing) is None
 
 
 def test_a_rescue_changes_nothing_while_sweeps_agree():
