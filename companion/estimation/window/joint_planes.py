@@ -62,11 +62,6 @@ class Sweep:
         self.near[own] = self.near[own] @ R.T + p
         self.owner[own] = _FIXED
 
-    def forget(self, owner: int) -> None:
-        """Planes of what `owner` has seen are none any more."""
-        self.near[(self.owner == owner).any(axis=1), 4] = np.inf
-        self.owner[self.owner == owner] = _FIXED
-
 
 def associate(sweep: Sweep, target: PointMap, fresh: FreshPoints, pose: tuple[Array, Array], c: PlaneConfig) -> None:
     """Search the five nearest of map and fresh points at the pose (R_odom_body, p_odom)."""

@@ -45,10 +45,12 @@ from companion.estimation.window.preintegration import (
     preintegrate,
 )
 from companion.estimation.window.prior import Prior, eliminate, pose_equations
+from companion.estimation.window.twist import deskewed_by_twist, twist_between
 
 if TYPE_CHECKING:  # of the front end, which has a rescue that has a window
     from companion.estimation.lio import LioConfig
 
+_BRIDGED_S = 0.012  # a longer piece of the IMU holds no sample: `ImuBuffer` bridges gaps by steps of up to 0.02 s
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
@@ -95,6 +97,8 @@ class JointWindow:
         self._hidden = np.zeros((9, 9))  # covariance of what the IMU has not told since the newest node
         self._thinner, self._map_error = Thinner(), MapError()
         self._blind = BlindAxes(lio.blind)
+        self._silent_s = 0.0  # of the IMU, up to the newest sweep
+        self._rate: Array | None = None  # rad/s, as a gyro would have it: of the last silent sweep
         self.normal: Normal | None = None  # what the newest sweep said of its own pose
 
     @property
@@ -117,27 +121,52 @@ class JointWindow:
         """Advance through IMU pieces (N, 7): dt, rate, specific force; `gap_s`: the longest time without a sample."""
         if not len(imu):
             return
+        bridged, doubt = imu[:, 0] > _BRIDGED_S, self._lio.imu_doubt
+        silent_s = min(gap_s, float(imu[bridged, 0].sum()))
+        if silent_s > doubt.gap_s and self._rate is not None:
+            imu = imu.copy()
+            imu[bridged, 1:4] = self._rate
         self.course.predict(imu, self._lio.noise.densities)
         self._imu.append(imu)
-        if gap_s > self._lio.imu_doubt.gap_s:
-            hidden = gap_covariance(gap_s, self._lio.imu_doubt)
+        # What a silent sweep is smeared by is wrong in its pose: it is as little known from there on.
+        hidden_s, self._silent_s = max(silent_s, self._silent_s), silent_s
+        if hidden_s > doubt.gap_s:
+            hidden = gap_covariance(hidden_s, doubt)
             self.filter.P[:9, :9] += hidden
             self._hidden = self._hidden + hidden
 
     def add_sweep(self, points_sensor: Array32, age_s: Array32) -> Array32:
-        """Take a sweep (N, 3) that ends now, each point `age_s` (N,) ago; returns it deskewed, body frame."""
-        body = self.course.deskewed(points_sensor, age_s, self._mount, self._lio.gate)
-        self.add_points(body)
+        """Take a sweep (N, 3) that ends now, each point `age_s` (N,) ago; returns it deskewed, body frame.
+
+        While the IMU is silent it is registered twice, the second time deskewed by the motion that the first has found.
+        """
+        gate = self._lio.gate
+        body = self.course.deskewed(points_sensor, age_s, self._mount, gate)
+        node = self._register(body)
+        if self._silent_s > self._lio.imu_doubt.gap_s and node.imu is not None and len(self._nodes) > 1:
+            twist = twist_between(self._nodes[-2].state, node.state, node.imu.seconds)
+            self._rate = twist[0] + node.state.gyro_bias
+            body = deskewed_by_twist((points_sensor, age_s), twist, node.state, self._mount, gate)
+            self._register(body)
+        self._settle(node)
         return body
 
     def add_points(self, body: Array32) -> None:
         """Take a sweep (N, 3) that is deskewed into the body frame of now."""
+        self._settle(self._register(body))
+
+    def _register(self, body: Array32) -> Node:
         few = self._thinner.centroids(body, self._lio.thin_m, at_most=self._lio.points)
         node = self._new_node()
         node.sweep = Sweep(few, self._thinner.firsts(body, self._lio.map.spacing_m))
         self._associate(node)
         self._solve()
-        self._find_fresh(node, node.sweep)
+        return node
+
+    def _settle(self, node: Node) -> None:
+        """A window that does not grow the map is lost: it must not believe what it saw itself."""
+        if self._grows and node.sweep is not None:
+            self._find_fresh(node, node.sweep)
         self._blind.seen()
         self._let_go()
 
@@ -279,10 +308,7 @@ class JointWindow:
         """
         R, p = node.state.R.copy(), node.state.p.copy()
         for _, other in self._sweeps():
-            if self._grows:
-                other.freeze(node.number, R, p)
-            else:
-                other.forget(node.number)
+            other.freeze(node.number, R, p)
         if not self._grows or not self._is_of_use(sweep):
             return
         share = self.map.insert(sweep.spaced, R, p) / max(len(sweep.spaced), 1)
