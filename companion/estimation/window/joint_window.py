@@ -16,12 +16,10 @@ Source: the window is that of T. Shan et al., "LIO-SAM", IROS 2020, with sweeps 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from companion.core.messages import Array, Array32
@@ -34,16 +32,11 @@ from companion.estimation.imu_doubt import gap_covariance
 from companion.estimation.map_error import MapError
 from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap
-from companion.estimation.state import ERROR, State
+from companion.estimation.state import ERROR
 from companion.estimation.window.fresh_points import FreshPoints, new_to
 from companion.estimation.window.joint_planes import Sweep, associate, linearise
-from companion.estimation.window.preintegration import (
-    NODE_ERROR,
-    ImuResidual,
-    Preintegrated,
-    imu_residual,
-    preintegrate,
-)
+from companion.estimation.window.nodes import Node, add_at, marginal, residual_between
+from companion.estimation.window.preintegration import NODE_ERROR, preintegrate
 from companion.estimation.window.prior import Prior, eliminate, pose_equations
 from companion.estimation.window.twist import deskewed_by_twist, twist_between
 
@@ -59,18 +52,6 @@ class JointWindowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
     sweeps: Annotated[int, msgspec.Meta(ge=1, le=40)] = 6  # the last ones
     iterations: Count = 10  # of Gauss-Newton per sweep, at most: mostly two
-
-
-@dataclass(slots=True)
-class Node:
-    """A state at the time of a sweep or an image; its gravity is that of the window."""
-
-    number: int
-    state: State
-    imu: Preintegrated | None  # from the node before
-    P: Array  # (6, 6), of the pose as it was predicted
-    sweep: Sweep | None = None
-    seen: Normal | None = None  # what an image said
 
 
 class JointWindow:
@@ -231,7 +212,7 @@ class JointWindow:
             if all(is_small(step[k : k + 6]) for k in range(0, len(step) - 3, NODE_ERROR)):
                 break
         self.filter.state.x[:] = self._nodes[-1].state.x
-        self.filter.P = _marginal(root, np.arange(len(g) - ERROR, len(g)), len(g))
+        self.filter.P = marginal(root, np.arange(len(g) - ERROR, len(g)), len(g))
         self.course.moved(before)
 
     def _search_again(self) -> None:
@@ -244,32 +225,22 @@ class JointWindow:
         size = NODE_ERROR * len(self._nodes) + 3
         H, g = np.zeros((size, size)), np.zeros(size)
         gravity = np.arange(size - 3, size)
-        _add(H, g, np.r_[np.arange(NODE_ERROR), gravity], self._prior.at_state(self._nodes[0].state))
+        add_at(H, g, np.r_[np.arange(NODE_ERROR), gravity], self._prior.at_state(self._nodes[0].state))
         for k, node in enumerate(self._nodes):
             if k > 0:
-                J, r = self._imu_jacobian(k)
                 at = np.r_[np.arange(NODE_ERROR * (k - 1), NODE_ERROR * (k + 1)), gravity]
-                _add(H, g, at, (J.T @ J, -J.T @ r))
+                add_at(H, g, at, residual_between(self._nodes[k - 1], node).equations)
             if node.seen is not None:
-                _add(H, g, np.arange(NODE_ERROR * k, NODE_ERROR * k + 6), pose_equations(node.seen, node.state))
+                add_at(H, g, np.arange(NODE_ERROR * k, NODE_ERROR * k + 6), pose_equations(node.seen, node.state))
         self._add_sweeps(H, g)
         return H, g
-
-    def _imu_jacobian(self, k: int) -> tuple[Array, Array]:
-        found = self._imu_residual(self._nodes[k - 1], self._nodes[k])
-        return np.hstack([found.by_first, found.by_second, found.by_gravity]), found.r
-
-    def _imu_residual(self, first: Node, second: Node) -> ImuResidual:
-        if second.imu is None:
-            raise ValueError("the first node of all has no IMU before it")
-        return imu_residual(second.imu, first.state, second.state, second.state.g)
 
     def _add_sweeps(self, H: Array, g: Array) -> None:
         R, p = np.array([n.state.R for n in self._nodes]), np.array([n.state.p for n in self._nodes])
         at = (NODE_ERROR * np.arange(len(self._nodes))[:, None] + np.arange(6)).ravel()
         for k, node in enumerate(self._nodes):
             if node.sweep is not None:
-                _add(H, g, at, self._said(node, node.sweep, k, (R, p)))
+                add_at(H, g, at, self._said(node, node.sweep, k, (R, p)))
 
     def _said(self, node: Node, sweep: Sweep, k: int, poses: tuple[Array, Array]) -> tuple[Array, Array]:
         """What a sweep says of all poses; a blind one of its own only, as the filter takes it."""
@@ -294,7 +265,7 @@ class JointWindow:
             pose = oldest.state.R[None].copy(), oldest.state.p[None].copy()
             said = [] if oldest.sweep is None else [self._said(oldest, oldest.sweep, 0, pose)]
             said += [] if oldest.seen is None else [pose_equations(oldest.seen, oldest.state)]
-            imu = self._imu_residual(oldest, after)
+            imu = residual_between(oldest, after)
             self._prior = eliminate(self._prior, said, imu, (oldest.state, after.state))
             self._nodes = self._nodes[1:]
             if oldest.sweep is not None:
@@ -314,16 +285,3 @@ class JointWindow:
         share = self.map.insert(sweep.spaced, R, p) / max(len(sweep.spaced), 1)
         self._map_error.move(p)
         self._map_error.extend(node.state, self.filter.P, share * self._lio.map_error.share)
-
-
-def _add(H: Array, g: Array, at: NDArray[np.int_], equations: tuple[Array, Array]) -> None:
-    H[np.ix_(at, at)] += equations[0]
-    g[at] += equations[1]
-
-
-def _marginal(root: tuple[Array, bool], at: NDArray[np.int_], size: int) -> Array:
-    """Covariance of some of the variables, from the Cholesky root of the whole information."""
-    columns = np.zeros((size, len(at)))
-    columns[at, np.arange(len(at))] = 1.0
-    P = cho_solve(root, columns, check_finite=False)[at]
-    return np.asarray(0.5 * (P + P.T))

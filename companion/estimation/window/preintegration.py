@@ -41,6 +41,12 @@ class ImuResidual:
     by_second: Array  # (15, 15)
     by_gravity: Array  # (15, 3)
 
+    @property
+    def equations(self) -> tuple[Array, Array]:
+        """Normal equations of both states and gravity, (33, 33) and (33,)."""
+        J = np.hstack([self.by_first, self.by_second, self.by_gravity])
+        return J.T @ J, -J.T @ self.r
+
 
 def preintegrate(imu: Array, biases: Array, densities: Array, *, hidden: Array | None = None) -> Preintegrated:
     """Pieces (N, 7) of dt, rate, specific force; biases (6,); densities (4,) of `ImuNoise`.

@@ -51,9 +51,8 @@ def eliminate(prior: Prior, said: list[tuple[Array, Array]], imu: ImuResidual, s
     for own, right in said:
         H[:6, :6] += own
         g[:6] += right
-    J = np.hstack([imu.by_first, imu.by_second, imu.by_gravity])
-    H += J.T @ J
-    g -= J.T @ imu.r
+    between = imu.equations
+    H, g = H + between[0], g + between[1]
     gone, kept = slice(0, NODE_ERROR), slice(NODE_ERROR, size)
     gain = np.linalg.solve(H[gone, gone], H[gone, kept]).T
     left = H[kept, kept] - gain @ H[gone, kept]
