@@ -31,6 +31,7 @@ class RescueConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     enabled: bool = True  # where sweeps do not agree with the map after a gap; idle else
     window: JointWindowConfig = JointWindowConfig()
+    points: Annotated[int, msgspec.Meta(ge=50)] = 1500  # of a sweep, at most: fewer cost less, and take longer
     in_a_row: Annotated[int, msgspec.Meta(ge=1)] = 3  # sweeps of which most must lie on the map
 
 
@@ -38,7 +39,7 @@ class Rescue:
     """Idle until a first sweep disagrees; then a window runs beside the filter and registers all of them."""
 
     def __init__(self, lio: LioConfig, rig: Rig) -> None:
-        self._lio, self._rig = lio, rig
+        self._lio, self._rig = msgspec.structs.replace(lio, points=min(lio.points, lio.rescue.points)), rig
         self._window: JointWindow | None = None
         self._agreed = 0
 
