@@ -133,6 +133,7 @@ class Lio:
             if found is None:
                 return ScanResult(points_body, None, agrees=False)
             points_body, normal = found
+            edges_body = self._edges.find(points_body) if self._edges else edges_body
         self._rescue.end()
         spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
         if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):

@@ -75,10 +75,9 @@ class JointWindow:
         self._nodes = [Node(0, start.state.copy(), None, start.P[:6, :6].copy())]
         self._prior = Prior(start.state.copy(), np.asarray(np.linalg.inv(start.P), np.float64), np.zeros(ERROR))
         self._imu: list[Array] = []
-        self._hidden = np.zeros((9, 9))  # covariance of what the IMU has not told since the newest node
         self._thinner, self._map_error = Thinner(), MapError()
         self._blind = BlindAxes(lio.blind)
-        self._silent_s = 0.0  # of the IMU, up to the newest sweep
+        self._silent_s = 0.0  # of the IMU, since the newest node
         self._rate: Array | None = None  # rad/s, as a gyro would have it: of the last silent sweep
         self.normal: Normal | None = None  # what the newest sweep said of its own pose
 
@@ -109,12 +108,9 @@ class JointWindow:
             imu[bridged, 1:4] = self._rate
         self.course.predict(imu, self._lio.noise.densities)
         self._imu.append(imu)
-        # What a silent sweep is smeared by is wrong in its pose: it is as little known from there on.
-        hidden_s, self._silent_s = max(silent_s, self._silent_s), silent_s
-        if hidden_s > doubt.gap_s:
-            hidden = gap_covariance(hidden_s, doubt)
-            self.filter.P[:9, :9] += hidden
-            self._hidden = self._hidden + hidden
+        self._silent_s += silent_s
+        if silent_s > doubt.gap_s:
+            self.filter.P[:9, :9] += gap_covariance(silent_s, doubt)
 
     def add_sweep(self, points_sensor: Array32, age_s: Array32) -> Array32:
         """Take a sweep (N, 3) that ends now, each point `age_s` (N,) ago; returns it deskewed, body frame.
@@ -124,7 +120,7 @@ class JointWindow:
         gate = self._lio.gate
         body = self.course.deskewed(points_sensor, age_s, self._mount, gate)
         node = self._register(body)
-        if self._silent_s > self._lio.imu_doubt.gap_s and node.imu is not None and len(self._nodes) > 1:
+        if node.silent_s > self._lio.imu_doubt.gap_s and node.imu is not None and len(self._nodes) > 1:
             twist = twist_between(self._nodes[-2].state, node.state, node.imu.seconds)
             self._rate = twist[0] + node.state.gyro_bias
             body = deskewed_by_twist((points_sensor, age_s), twist, node.state, self._mount, gate)
@@ -162,9 +158,13 @@ class JointWindow:
         if not self._imu:
             return newest
         pieces, densities = np.concatenate(self._imu), self._lio.noise.densities
-        imu = preintegrate(pieces, newest.state.x[15:21], densities, hidden=self._hidden)
-        self._imu, self._hidden = [], np.zeros((9, 9))
-        self._nodes.append(Node(newest.number + 1, f.state.copy(), imu, f.P[:6, :6].copy()))
+        # What a silent sweep is smeared by is wrong in its pose: it is as little known from there on.
+        hidden_s, doubt = max(self._silent_s, newest.silent_s), self._lio.imu_doubt
+        hidden = gap_covariance(hidden_s, doubt) if hidden_s > doubt.gap_s else None
+        imu = preintegrate(pieces, newest.state.x[15:21], densities, hidden=hidden)
+        node = Node(newest.number + 1, f.state.copy(), imu, f.P[:6, :6].copy(), silent_s=self._silent_s)
+        self._imu, self._silent_s = [], 0.0
+        self._nodes.append(node)
         return self._nodes[-1]
 
     def _sweeps(self) -> list[tuple[Node, Sweep]]:

@@ -25,6 +25,7 @@ class Node:
     P: Array  # (6, 6), of the pose as it was predicted
     sweep: Sweep | None = None
     seen: Normal | None = None  # what an image said
+    silent_s: float = 0.0  # of the IMU since the node before
 
 
 def residual_between(first: Node, second: Node) -> ImuResidual:
