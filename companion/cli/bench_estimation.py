@@ -24,6 +24,7 @@ from companion.runtime.bench.estimation_courses import ring, tour
 from companion.runtime.bench.estimation_faults import fault
 from companion.runtime.bench.estimation_peers import missing
 from companion.runtime.bench.estimation_recording import LOG, record_course
+from companion.runtime.bench.estimation_starts import StartRow, wrong_starts
 
 WORLDS = {
     "forest": "poisson,size_m=150,stems_per_ha=300,branches=4,roughness_m=0.15,margin_m=30",
@@ -33,8 +34,8 @@ WORLDS = {
     "branches=0,roughness_m=0.15,margin_m=30",
 }
 COLUMNS = (
-    "flight", "fault", "estimator", "ATE m", "drift %", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba", "p",
-    "in 3 sigma", "rank", "gap m",
+    "flight", "fault", "estimator", "ATE m", "drift %", "1 s m", "front ms", "all ms", "tilt", "yaw", "v", "bg", "ba",
+    "p", "in 3 sigma", "rank", "gap m",
 )  # fmt: skip
 
 
@@ -51,6 +52,12 @@ def estimation(
     peers_until_s: Annotated[
         float, typer.Option(min=1, help="Flown seconds that peers get: KISS-ICP may take a second for a sweep.")
     ] = 40.0,
+    joint_window: Annotated[
+        bool, typer.Option("--joint-window", help="Rows of the graph and of a joint window beside the filter, too.")
+    ] = False,
+    wrong_start: Annotated[
+        str, typer.Option(help="Instead: who finds back from starts so far off, m/degrees; with commas: 0.3/3,0.6/6.")
+    ] = "",
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override, sim.* of what is recorded, too; repeatable.")
     ] = None,
@@ -63,6 +70,7 @@ def estimation(
     freedom: 1 is honest. CPU times are those of this thread. JSON is also printed if standard output is no terminal.
     """
     check_out(out)
+    offsets = _offsets(wrong_start)
     asked = faults or ["none"]
     for text in asked:
         fault(text)
@@ -75,7 +83,10 @@ def estimation(
         folders = (
             [(flight, flight.name)] if flight else _folders(courses, speeds, seeds, recordings or Path(scratch), own)
         )
-        done = list(written(_rows(folders, asked, config, peers_s), out=out, plain=plain))
+        if offsets:
+            _from_wrong_starts(folders, asked, config, offsets, (out, plain, console))
+            return
+        done = list(written(_rows(folders, asked, config, peers_s, joint_window), out=out, plain=plain))
     if not plain:
         console.print(estimation_table(done))
 
@@ -85,9 +96,41 @@ def _rows(
     faults: list[str],
     config: Config,
     peers_s: float,
+    joint: bool,
 ) -> Iterator[EstimationRow]:
     for folder, name in folders:
-        yield from bench_flight(folder, name, faults, config, peers_until_s=peers_s)
+        yield from bench_flight(folder, name, faults, config, peers_until_s=peers_s, joint=joint)
+
+
+def _from_wrong_starts(
+    folders: Sequence[tuple[Path, str]] | Iterator[tuple[Path, str]],
+    faults: list[str],
+    config: Config,
+    offsets: list[tuple[float, float]],
+    where: tuple[Path | None, bool, Console],
+) -> None:
+    out, plain, console = where
+    rows = (
+        row
+        for folder, name in folders
+        for text in faults
+        for offset in offsets
+        for row in wrong_starts(folder, name, text, config, offset)
+    )
+    done = list(written(rows, out=out, plain=plain))
+    if not plain:
+        console.print(_starts_table(done))
+
+
+def _starts_table(rows: list[StartRow]) -> Table:
+    table = Table(title="From wrong starts: found back within 5 cm and 0.5 degrees after 3 s of sweeps")
+    for name in ("flight", "fault", "estimator", "off m", "off deg", "found back", "first m", "last m", "worst m"):
+        table.add_column(name)
+    for r in rows:
+        figures = (f"{x:.3f}" for x in (r.first_m, r.last_m, r.worst_m))
+        found = f"{r.recovered} of {r.starts}"
+        table.add_row(r.flight, r.fault, r.estimator, f"{r.offset_m:g}", f"{r.offset_deg:g}", found, *figures)
+    return table
 
 
 def _folders(courses: str, speeds: str, seeds: str, parent: Path, own: list[str]) -> Iterator[tuple[Path, str]]:
@@ -108,6 +151,15 @@ def _record(kind: str, speed: float, seed: int, folder: Path, own: list[str]) ->
     with open_simulator(WORLDS[kind], seed, [*GUSTS, *own], 0, console) as sim:
         course = ring(top_m_s=speed) if kind == "clearing" else tour(sim.world.cones, top_m_s=speed, seed=seed)
         record_course(course, folder, stack_config(None, ()), sim=sim.new_node(), mission=course_mission())
+
+
+def _offsets(text: str) -> list[tuple[float, float]]:
+    """Pairs of metres and degrees."""
+    try:
+        pairs = [part.split("/") for part in text.split(",") if part]
+        return [(float(m), float(deg)) for m, deg in pairs]
+    except ValueError:
+        raise InputError(f"{text!r}", field="--wrong-start", valid="metres/degrees, with commas: 0.3/3,0.6/6") from None
 
 
 def _seeds(text: str) -> list[int]:
@@ -132,7 +184,8 @@ def cells(row: EstimationRow) -> list[str]:
     n = row.nees
     parts = (n.tilt, n.yaw, n.velocity, n.gyro_bias, n.accel_bias, n.position) if n else (None,) * 6
     return [
-        row.flight, row.fault, row.estimator, f"{row.ate_m:.3f}", f"{row.drift_percent:.3f}", f"{row.front_ms:.1f}",
+        row.flight, row.fault, row.estimator, f"{row.ate_m:.3f}", f"{row.drift_percent:.3f}",
+        "" if row.relative_m is None else f"{row.relative_m:.3f}", f"{row.front_ms:.1f}",
         f"{row.all_ms:.1f}", *("" if x is None else f"{x:.2f}" for x in (*parts, row.covered, row.quality_rank)),
         f"{np.median([g.error_m for g in row.gaps]):.3f}" if row.gaps else "",
     ]  # fmt: skip

@@ -36,6 +36,7 @@ from companion.estimation.registration import PlaneConfig, PlaneRegistration
 from companion.estimation.search import SearchConfig, few_of, search
 from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
+from companion.estimation.window.rescue import Rescue, RescueConfig
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 _MET = 0.05  # of a sweep's points: fewer on the map say nothing
@@ -55,6 +56,7 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     edges: EdgesConfig = EdgesConfig()
     map_error: MapErrorConfig = MapErrorConfig()
     search: SearchConfig = SearchConfig()
+    rescue: RescueConfig = RescueConfig()
     imu_doubt: ImuDoubtConfig = ImuDoubtConfig()
     weak_below: Annotated[float, msgspec.Meta(ge=0)] = 0.005  # normalised eigenvalue: such an axis is named
     blind: BlindAxesConfig = BlindAxesConfig()
@@ -95,6 +97,7 @@ class Lio:
         self._densities = config.noise.densities
         self._standing = Standing(start, config.standing, self._densities)
         self._swept: Normal | None = None  # what the newest sweep said
+        self._rescue = Rescue(config, rig)
         self._tracker = self._camera_of(camera or CameraConfig(), rig)
 
     @classmethod
@@ -112,6 +115,7 @@ class Lio:
             self._clock.arise(self._course, otherwise, self._densities)
         if len(imu):
             self._course.predict(imu, self._densities)
+            self._rescue.predict(imu, gap_s)
             self._standing.watch(imu, self.filter)
             self._imu_doubt.gap(self.filter, gap_s)
             self._silent = gap_s > self.config.imu_doubt.gap_s
@@ -125,7 +129,12 @@ class Lio:
         edges_body = self._edges.find(points_body) if self._edges else np.empty((0, 3))
         normal = self._register(points_body, edges_body) if self.map.voxels else None
         if normal is None and self.map.voxels:
-            return ScanResult(points_body, None, agrees=False)
+            found = self._rescued(points_sensor, age_s)
+            if found is None:
+                return ScanResult(points_body, None, agrees=False)
+            points_body, normal = found
+            edges_body = self._edges.find(points_body) if self._edges else edges_body
+        self._rescue.end()
         spaced = self._thinner.firsts(points_body, self.config.map.spacing_m)
         if normal is None or normal.used >= self.config.min_planes or not self._is_known(normal):
             if not self._silent:  # nobody knows how the vehicle turned meanwhile, so the sweep is smeared
@@ -197,6 +206,14 @@ class Lio:
         self._blind.seen()
         self._imu_doubt.corrected(self.filter)
         return normal
+
+    def _rescued(self, points_sensor: Array32, age_s: Array32) -> tuple[Array32, Normal] | None:
+        """The sweep, and what it said, if several together agree with the map; while the time is in doubt none does."""
+        if self._clock.is_open:
+            return None
+        found = self._rescue.look(self._course, self.map, points_sensor, age_s)
+        self._swept = self._swept if found is None else found[1]
+        return found
 
     def _registration(self, few: Array, edges_body: Array, how: tuple[PlaneConfig, LineConfig]) -> Registration:
         """Of points (N, 3) and edges (M, 3), m, body frame."""

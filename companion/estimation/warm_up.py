@@ -8,9 +8,12 @@ from companion.core.messages import Array32, CameraImage, ImuSample, LidarScan, 
 from companion.core.rig import Rig
 from companion.core.topics import CAMERA, IMU, LIDAR, LIO_STATE, ODOMETRY
 from companion.estimation.config import EstimationConfig
+from companion.estimation.course import Course
 from companion.estimation.lio_node import LioNode
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagator_node import PropagatorNode
+from companion.estimation.start import start_filter
+from companion.estimation.window.joint_window import JointWindow
 
 IMU_PERIOD_NS, SWEEP_NS, FRAME_NS = 5_000_000, 100_000_000, 66_666_667
 SECONDS = 3
@@ -19,6 +22,7 @@ SECONDS = 3
 def warm_up(config: EstimationConfig, rig: Rig) -> int:
     """Stand for 3 s among pillars, with nodes that are thrown away; returns how many states they gave."""
     PointMap(PointMapConfig()).insert(np.zeros((1 << 17, 3), np.float32), np.eye(3), np.zeros(3))  # its table grows
+    _rescue(config, rig)
     lio, propagator = LioNode(config, rig), PropagatorNode(config)
     rng = np.random.default_rng(0)
     frame = rng.integers(0, 250, (rig.pinhole.height_px, rig.pinhole.width_px), dtype=np.uint8)
@@ -36,6 +40,17 @@ def warm_up(config: EstimationConfig, rig: Rig) -> int:
         for state in states[-1:]:
             _propagate(propagator, state, sample)
     return sum(o.topic is LIO_STATE for o in outputs)
+
+
+def _rescue(config: EstimationConfig, rig: Rig) -> None:
+    """What a rescue would run for the first time in the middle of a flight: a window that some sweeps leave again."""
+    lio, rng, rest = config.lio, np.random.default_rng(0), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 9.80665]])
+    start = start_filter(np.repeat(rest, 20, axis=0), lio.start, t_s=0.0)
+    window = JointWindow(Course(start), PointMap(lio.map), lio.rescue.window, lio, rig)
+    for _ in range(lio.rescue.window.sweeps + 2):
+        window.predict(np.repeat(np.column_stack([[0.005], rest]), 20, axis=0))
+        sweep = freeze(_sweep(0, rng))
+        window.add_sweep(sweep.points_sensor, sweep.point_age_s)
 
 
 def _propagate(propagator: PropagatorNode, state: LioState, sample: ImuSample) -> None:

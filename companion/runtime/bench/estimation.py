@@ -13,10 +13,11 @@ import msgspec
 import numpy as np
 
 from companion.config import Config
+from companion.core.geometry import rotation_from_quaternion
 from companion.core.messages import Array
 from companion.core.rig import Rig
 from companion.runtime.bench.estimation_faults import fault
-from companion.runtime.bench.estimation_gaps import Gap, gaps_of
+from companion.runtime.bench.estimation_gaps import Gap, gaps_of, returns_of
 from companion.runtime.bench.estimation_peers import Peer, peers
 from companion.runtime.bench.estimation_recording import heard, true_biases
 from companion.runtime.bench.estimation_replay import Run, feed
@@ -27,10 +28,11 @@ from companion.runtime.bench.estimation_score import (
     estimates_of,
     nees_of,
     rank_correlation,
+    relative_m,
     truth_at,
 )
 
-OWN = "understory"
+OWN, GRAPH, JOINT = "understory", "graph", "joint window"
 PEER_RANGE_M = 60.0
 _OFFSETS_NS = (0, -50_000_000, -100_000_000)  # a peer may mean any part of a sweep; the best counts
 
@@ -47,6 +49,8 @@ class EstimationRow(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
     length_m: float
     front_ms: float  # CPU per sweep: filter with all sensors
     all_ms: float  # propagator and graph, too
+    relative_m: float | None = None  # rms error of the motion over 1 s
+    back_m: tuple[tuple[float, float], ...] = ()  # gaps: error at the first sweep after, and 3 s later
     nees: Nees | None = None
     covered: float | None = None  # share of the time in which the position error is within three published sigmas
     quality_rank: float | None = None  # Spearman's, of published quality and accuracy
@@ -55,9 +59,12 @@ class EstimationRow(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
 
 
 def bench_flight(
-    folder: Path, flight: str, faults: Sequence[str], config: Config, *, peers_until_s: float
+    folder: Path, flight: str, faults: Sequence[str], config: Config, *, peers_until_s: float, joint: bool = False
 ) -> Iterator[EstimationRow]:
-    """One row per fault, and one per peer on the flight without faults, up to `peers_until_s`; 0: no peers."""
+    """One row per fault, and one per peer on the flight without faults, up to `peers_until_s`; 0: no peers.
+
+    `joint`: rows of the graph and of a joint window that ran beside the filter, too.
+    """
     for text in faults:
         others = peers(max_range_m=PEER_RANGE_M) if peers_until_s > 0.0 and text == "none" else {}
         run = feed(
@@ -65,17 +72,21 @@ def bench_flight(
             config.estimation,
             config.rig,
             spoil=fault(text),
+            with_joint=joint,
             others=list(others.values()),
             others_until_s=peers_until_s,
         )
         yield own_row(run, flight, text, true_biases(folder))
+        if joint:
+            yield graph_row(run, flight, text)
+            yield joint_row(run, flight, text, true_biases(folder))
         for name, peer in others.items():
             yield peer_row(name, peer, run, flight, config.rig)
 
 
 def own_row(run: Run, flight: str, fault_text: str, biases: tuple[Array, Array] | None) -> EstimationRow:
     """Figures of our run."""
-    e = estimates_of(run)
+    e = estimates_of(run.states)
     true = truth_at(run.truth, e.stamps_ns, R_first=e.R[0], p_first=e.p[0])
     found = accuracy(e.stamps_ns, e.R, e.p, run.truth)
     stamps_ns = np.array([o.stamp_ns for o in run.odometry])
@@ -87,12 +98,53 @@ def own_row(run: Run, flight: str, fault_text: str, biases: tuple[Array, Array] 
         estimator=OWN,
         **msgspec.structs.asdict(found),
         front_ms=run.cpu_ms_per_scan("LioNode"),
-        all_ms=run.cpu_ms_per_scan(),
+        all_ms=run.cpu_ms_per_scan("LioNode", "PropagatorNode", "GraphNode"),
+        relative_m=relative_m(e.stamps_ns, e.R, e.p, true),
+        back_m=returns_of(e.stamps_ns, true.p - e.p),
         nees=nees_of(e, true, biases),
         covered=covered,
         quality_rank=rank,
         gaps=gaps_of(run, published),
         why=tuple(f"{w.stamp_ns * 1e-9:.1f} s: {w.what}: {w.because}" for w in run.why),
+    )
+
+
+def graph_row(run: Run, flight: str, fault_text: str) -> EstimationRow:
+    """Figures of the newest node of the graph, in `map`; its covariance is that of a pose alone."""
+    stamps_ns = np.array([s.stamp_ns for s in run.smoothed])
+    R, p = (
+        np.array([rotation_from_quaternion(s.q_map_body) for s in run.smoothed]),
+        np.array([s.p_map for s in run.smoothed]),
+    )
+    true = truth_at(run.truth, stamps_ns, R_first=R[0], p_first=p[0])
+    own_ms = run.cpu_ms_per_scan("GraphNode")
+    return EstimationRow(
+        flight=flight,
+        fault=fault_text,
+        estimator=GRAPH,
+        **msgspec.structs.asdict(accuracy(stamps_ns, R, p, run.truth)),
+        front_ms=own_ms,
+        all_ms=own_ms,
+        relative_m=relative_m(stamps_ns, R, p, true),
+        back_m=returns_of(stamps_ns, true.p - p),
+    )
+
+
+def joint_row(run: Run, flight: str, fault_text: str, biases: tuple[Array, Array] | None) -> EstimationRow:
+    """Figures of the joint window's newest state; it has the filter's start, and so its `odom`."""
+    e = estimates_of([run.states[0], *run.joint])
+    true = truth_at(run.truth, e.stamps_ns, R_first=e.R[0], p_first=e.p[0])
+    own_ms = run.cpu_ms_per_scan("JointWindowNode")
+    return EstimationRow(
+        flight=flight,
+        fault=fault_text,
+        estimator=JOINT,
+        **msgspec.structs.asdict(accuracy(e.stamps_ns, e.R, e.p, run.truth)),
+        front_ms=own_ms,
+        all_ms=own_ms,
+        relative_m=relative_m(e.stamps_ns, e.R, e.p, true),
+        back_m=returns_of(e.stamps_ns, true.p - e.p),
+        nees=nees_of(e, true, biases),
     )
 
 

@@ -40,6 +40,16 @@ def gaps_of(run: Run, true: Truth) -> tuple[Gap, ...]:
     return tuple(_gap(a, b, stamps, off, steps, run.odometry) for a, b in ends)
 
 
+def returns_of(stamps_ns: Array, off: Array) -> tuple[tuple[float, float], ...]:
+    """Per gap, m: change of the errors `off` (N, 3) from the last state before to the first after, and 3 s later."""
+    ends = np.flatnonzero(np.diff(stamps_ns) > _LEAST_S * 1e9) + 1
+    later = np.searchsorted(stamps_ns, stamps_ns[ends] + round(_LATER_S * 1e9))
+    pairs = [(a, b) for a, b in zip(ends, later, strict=True) if b < len(stamps_ns)]
+    return tuple(
+        (float(np.linalg.norm(off[a] - off[a - 1])), float(np.linalg.norm(off[b] - off[a - 1]))) for a, b in pairs
+    )
+
+
 def _gap(begin_ns: int, end_ns: int, stamps: Array, off: Array, steps: Array, odometry: list[Odometry]) -> Gap:
     before, back, later = np.searchsorted(stamps, [begin_ns, end_ns, end_ns + _LATER_S * 1e9])
     last = back - 1

@@ -17,6 +17,7 @@ from companion.core.node import Node, Topic
 from companion.core.rig import Rig
 from companion.estimation.config import EstimationConfig
 from companion.estimation.node import GraphNode, LioNode, PropagatorNode
+from companion.runtime.bench.estimation_joint import JOINT_STATE, JointWindowNode
 from companion.runtime.bench.estimation_peers import Peer
 from companion.runtime.lockstep import name
 
@@ -32,13 +33,14 @@ class Run:
     states: list[LioState] = field(default_factory=list)
     odometry: list[Odometry] = field(default_factory=list)
     smoothed: list[SmoothedState] = field(default_factory=list)
+    joint: list[LioState] = field(default_factory=list)
     why: list[Why] = field(default_factory=list)
     scans: int = 0
     cpu_s: dict[str, float] = field(default_factory=dict)
 
     def forget_from(self, stamp_ns: int) -> None:
         """The clock went back: what was before has the same stamps as what comes."""
-        lists: tuple[list[Any], ...] = (self.truth, self.states, self.odometry, self.smoothed)
+        lists: tuple[list[Any], ...] = (self.truth, self.states, self.odometry, self.smoothed, self.joint)
         for kept in lists:
             del kept[next((k for k, m in enumerate(kept) if m.stamp_ns >= stamp_ns), len(kept)) :]
 
@@ -54,6 +56,7 @@ def feed(
     *,
     spoil: Spoil | None = None,
     with_graph: bool = True,
+    with_joint: bool = False,
     others: Sequence[Peer] = (),
     until_s: float = float("inf"),
     others_until_s: float = float("inf"),
@@ -65,6 +68,7 @@ def feed(
     run = Run()
     nodes: list[Node] = [LioNode(config, rig), PropagatorNode(config)]
     nodes += [GraphNode(config, rig)] if with_graph else []
+    nodes += [JointWindowNode(config, rig)] if with_joint else []
     for time_ns, topic, heard_message in messages:
         if time_ns > until_s * 1e9:
             break
@@ -97,6 +101,7 @@ def _keep(run: Run, topic: Topic[Any], message: Any) -> None:
         topics.LIO_STATE.name: run.states,
         topics.ODOMETRY.name: run.odometry,
         topics.SMOOTHED.name: run.smoothed,
+        JOINT_STATE.name: run.joint,
         topics.WHY.name: run.why,
     }
     if topic is topics.TRUTH and run.truth and message.stamp_ns <= run.truth[-1].stamp_ns:

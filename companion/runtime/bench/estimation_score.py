@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import spearmanr
 
-from companion.core.messages import Array, GroundTruth
-from companion.runtime.bench.estimation_replay import Run
+from companion.core.messages import Array, GroundTruth, LioState
 from companion.runtime.trajectory_error import align, drift_percent, path_length
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])
@@ -64,9 +63,9 @@ class Estimates:
     covariance: Array  # (N, 18, 18)
 
 
-def estimates_of(run: Run) -> Estimates:
+def estimates_of(said: list[LioState]) -> Estimates:
     """The states after sweeps, and the one of the start."""
-    states = [s for s in run.states if s.source != "camera"]
+    states = [s for s in said if s.source != "camera"]
     return Estimates(
         stamps_ns=np.array([s.stamp_ns for s in states]),
         R=_rotations([s.q_odom_body for s in states]).as_matrix(),
@@ -99,6 +98,19 @@ def accuracy(stamps_ns: Array, R: Array, p: Array, truth: list[GroundTruth]) -> 
         drift_percent=drift_percent(p, true.p, R, true.R),
         length_m=path_length(true.p),
     )
+
+
+def relative_m(stamps_ns: Array, R: Array, p: Array, true: Truth, *, over_s: float = 1.0) -> float:
+    """Rms error of the motion over `over_s`, in the body frame of its begin: what alignment and drift say nothing of.
+
+    Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, sec. IV.B.
+    """
+    later = np.searchsorted(stamps_ns, stamps_ns + round(over_s * 1e9))
+    first = np.flatnonzero(later < len(stamps_ns))
+    last = later[first]
+    moved = np.einsum("nji,nj->ni", R[first], p[last] - p[first])
+    truly = np.einsum("nji,nj->ni", true.R[first], true.p[last] - true.p[first])
+    return float(np.sqrt(((moved - truly) ** 2).sum(axis=1).mean()))
 
 
 def nees_of(e: Estimates, true: Truth, biases: tuple[Array, Array] | None, *, from_s: float = 3.0) -> Nees:

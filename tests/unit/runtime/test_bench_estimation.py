@@ -10,7 +10,7 @@ from companion.core import topics
 from companion.core.errors import InputError
 from companion.core.messages import CameraImage, GroundTruth, ImuSample, LidarScan, Odometry
 from companion.runtime.bench.estimation_faults import fault
-from companion.runtime.bench.estimation_gaps import gaps_of
+from companion.runtime.bench.estimation_gaps import gaps_of, returns_of
 from companion.runtime.bench.estimation_replay import Run
 from companion.runtime.bench.estimation_score import (
     GRAVITY,
@@ -20,6 +20,7 @@ from companion.runtime.bench.estimation_score import (
     nees_of,
     normalised,
     rank_correlation,
+    relative_m,
 )
 
 
@@ -135,3 +136,21 @@ def test_a_gap_is_found_in_what_was_used_and_measured_from_its_beginning():
     assert gap.sigma_m == pytest.approx(0.36) and gap.covered  # 0.9 of 1.08
     assert gap.step_m == pytest.approx(0.85, abs=0.02)  # back at once: odometry's one step
     assert gaps_of(*gap_run(jump_m=-0.3))[0].later_m == pytest.approx(0.3, abs=1e-6)
+
+
+def test_a_steady_slip_is_the_error_of_a_second():
+    """1 cm/s along the body, whatever the heading; a wrong frame says nothing."""
+    t = np.arange(0, 20, 0.1)
+    R = Rotation.from_euler("z", 0.2 * t[:, None])
+    truly = np.cumsum(R.apply([0.3, 0.0, 0.0]), axis=0)
+    said = np.cumsum(R.apply([0.301, 0.0, 0.0]), axis=0)
+    turn = Rotation.from_euler("z", 0.7)
+    true = Truth((turn * R).as_matrix(), turn.apply(truly) + 5.0, np.zeros_like(truly), GRAVITY)
+    assert relative_m((t * 1e9).round().astype(np.int64), R.as_matrix(), said, true) == pytest.approx(0.01, rel=0.01)
+
+
+def test_a_gap_tells_the_error_at_its_end_and_later():
+    stamps = np.delete(np.arange(100), range(30, 60)) * 100_000_000
+    off = np.zeros((70, 3))
+    off[:30], off[30], off[60:] = [1.0, 0.0, 0.0], [1.0, 0.5, 0.0], [1.0, 0.0, 0.02]
+    assert returns_of(stamps, off) == ((pytest.approx(0.5), pytest.approx(0.02)),)
