@@ -8,7 +8,6 @@ lio.filter.state.p                        # where we are, in odom
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import msgspec
@@ -33,6 +32,7 @@ from companion.estimation.normal import Normal
 from companion.estimation.point_map import PointMap, PointMapConfig
 from companion.estimation.propagation import ImuNoise
 from companion.estimation.registration import PlaneConfig, PlaneRegistration
+from companion.estimation.scan_result import ScanResult
 from companion.estimation.search import SearchConfig, few_of, search
 from companion.estimation.standing import Standing, StandingConfig
 from companion.estimation.start import StartConfig, start_filter
@@ -66,15 +66,6 @@ class LioConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     points: Count = 1500  # and at most so many
     iterations: Count = 5
     min_planes: Annotated[int, msgspec.Meta(ge=6)] = 20  # or edges on lines; fewer: the scan is not used
-
-
-@dataclass(frozen=True, slots=True)
-class ScanResult:
-    """A deskewed scan, and what it said (None: nothing, e.g. the first)."""
-
-    points_body: Array32  # (N, 3)
-    normal: Normal | None
-    agrees: bool = True  # False: it came after a gap and does not fit the map; nothing was corrected
 
 
 class Lio:
