@@ -20,9 +20,10 @@ from companion.core.rig import Rig
 from companion.core.topics import CAMERA, IMU, LIDAR, LIKELIHOOD, LIO_STATE, REGISTERED, WHY
 from companion.estimation.config import EstimationConfig
 from companion.estimation.imu_doubt import new_buffer
-from companion.estimation.lio import Lio, ScanResult
+from companion.estimation.lio import Lio
 from companion.estimation.normal import Normal
 from companion.estimation.ordering import Reorder
+from companion.estimation.scan_result import ScanResult
 from companion.estimation.start import is_at_rest
 
 _START_CHECK_NS = 100_000_000
